@@ -89,6 +89,12 @@ def test_modules_have_no_import_cycles() -> None:
     graphlib.TopologicalSorter(graph).prepare()  # raises CycleError
 
 
+def test_windows_is_named() -> None:
+    code = "import sys; sys.platform = 'win32'; import radejax"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert "ImportError: radejax runs on Linux and macOS; on Windows" in done.stderr
+
+
 @pytest.mark.parametrize(
     ("code", "absent"),
     [

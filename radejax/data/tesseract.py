@@ -197,7 +197,7 @@ def _read_columns(
 # MATLAB v5 files --------------------------------------------------------------------
 
 _MATRIX, _DEFLATED = 14, 15
-_INT8, _UINT8, _INT32, _UINT32 = 1, 2, 5, 6
+_INT8, _INT32, _UINT32 = 1, 5, 6
 # Types of arrays and types of stored values, by their numbers in the format.
 _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4"}
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"}
@@ -307,9 +307,8 @@ def _parse(file: BinaryIO, head: bytes) -> tuple[str, Layout | None]:
     )
     name_kind, name_size, at, after = _tag(head, after)
     name = head[at : at + name_size].decode("ascii", "replace")
-    # MATLAB writes the first of these types, other programs also the second.
-    is_known = dims_kind in (_INT32, _UINT32) and name_kind in (_INT8, _UINT8)
-    if not is_known or dims_size % 4:
+    # MATLAB writes int32 shapes; uint32 shapes of other programs are read too.
+    if dims_kind not in (_INT32, _UINT32) or dims_size % 4 or name_kind != _INT8:
         raise _corrupted(file, f"shape of type {dims_kind}, name of type {name_kind}")
     if name != VARIABLE:
         return name, None

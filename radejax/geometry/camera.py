@@ -54,7 +54,7 @@ LOOKING_AHEAD = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 """Rotation from LiDAR axes to the axes of a camera that looks straight ahead."""
 
 _MAX_PIXELS = 1 << 16
-_AZIMUTHS_DEG = range(-45, 46, 5)
+_AZIMUTHS_DEG = range(-30, 31, 5)
 _MAX_VALUE = 1e9  # far beyond pixels, coefficients and meters of any camera
 
 # Pairs of corner indices in the order of `boxes.corners`.

@@ -59,9 +59,8 @@ def find_frames(
     for path in map(files.as_path, paths):
         if not path.exists():
             raise FileNotFoundError(f"no such file or folder: {path}")
-        if path.is_file():
-            found.add(path)
-        found.update(files.find_files(path, *PATTERNS))
+        is_file = path.is_file()
+        found.update([path] if is_file else files.find_files(path, *PATTERNS))
     folders = {_sequence(path) for path in found}
     if sequence_numbers:
         folders = {f for f in folders if sequence_number(f) in sequence_numbers}

@@ -1,8 +1,10 @@
 """One line and an exit code for the user's errors; a traceback for ours."""
 
 import errno
+import os
 import sys
 
+import click
 import jax
 import pytest
 
@@ -75,3 +77,37 @@ def test_a_coordinator_that_is_not_reached_is_one_line(
         UserError, match=r"cannot join the other processes \(DEADLINE.*"
     ):
         join_processes("h:1", 2, 1)
+
+
+def test_home_folders_in_arguments(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/home/me")
+    given = ["--data=~/a,~/b,/c~", "~", "--config.data.roots=('~/a',)", "a~/b", "x=~me"]
+    wanted = ["--data=/home/me/a,/home/me/b,/c~", "/home/me"]
+    wanted += ["--config.data.roots=('/home/me/a',)", "a~/b", "x=~me"]
+    assert entry.expand_home(given) == wanted
+
+
+@pytest.mark.parametrize("variable", ["XDG_CACHE_HOME", "JAX_COMPILATION_CACHE_DIR"])
+def test_compiled_programs_are_cached_with_and_without_a_home_folder(
+    variable: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    updates: dict[str, object] = {}
+    monkeypatch.setattr(jax.config, "update", updates.__setitem__)
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # no home folder
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", "")
+    entry.set_up_jax()
+    assert "jax_compilation_cache_dir" not in updates
+    monkeypatch.setenv(variable, "/cache")
+    entry.set_up_jax()
+    own = variable == "XDG_CACHE_HOME"
+    found = updates.get("jax_compilation_cache_dir")
+    assert found == ("/cache/radejax/jax" if own else None)
+
+
+def test_numbers_of_options_are_finite_and_in_their_range() -> None:
+    command = click.Command("x", params=[click.Option(["--y"], type=entry.FRACTION)])
+    for text in ("nan", "inf", "-0.1", "30"):
+        with pytest.raises(click.BadParameter):
+            command.make_context("x", ["--y", text])
+    assert command.make_context("x", ["--y", "0.5"]).params == {"y": 0.5}

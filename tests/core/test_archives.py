@@ -1,10 +1,17 @@
+import errno
 import io
 import zipfile
 
 import numpy as np
 import pytest
 
-from radejax.core.archives import read_member, read_npy, read_npz
+from radejax.core.archives import (
+    read_member,
+    read_npy,
+    read_npz,
+    read_safetensors,
+    wrap_read_errors,
+)
 from radejax.core.errors import DataError
 
 
@@ -86,3 +93,20 @@ def test_errors_of_the_file_system_are_not_corruption(tmp_path):
         read_npy(tmp_path / "none.npy")
     with pytest.raises(IsADirectoryError):
         read_npz(tmp_path)
+
+
+def test_a_disk_that_does_not_answer_is_no_corruption(tmp_path):
+    with (
+        pytest.raises(OSError, match=r"Input/output error: 'a\.mat'"),
+        wrap_read_errors("a.mat", "a MATLAB file"),
+    ):
+        raise OSError(errno.EIO, "Input/output error")
+
+
+def test_a_pointer_in_place_of_weights(tmp_path):
+    path = tmp_path / "model.safetensors"
+    path.write_text(
+        "version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n"
+    )
+    with pytest.raises(DataError, match=r"model\.safetensors: a pointer of Git LFS"):
+        read_safetensors(path)

@@ -78,3 +78,30 @@ def test_a_lock_is_held_once(tmp_path: pathlib.Path) -> None:
         pass
     with files.lock(path, "let go, though the file is there"):
         pass
+
+
+def test_files_are_found_through_links_once(tmp_path: pathlib.Path) -> None:
+    root, disk = tmp_path / "root", tmp_path / "disk"
+    for name in ("5/a.npy", "5/b.txt", "5/deep/c.npy"):
+        (disk / name).parent.mkdir(parents=True, exist_ok=True)
+        (disk / name).touch()
+    root.mkdir()
+    (root / "5").symlink_to(disk / "5")
+    (root / "again").symlink_to(disk / "5")
+    (disk / "5" / "loop").symlink_to(root)
+    assert files.find_files(root, "*.npy") == [root / "5/a.npy", root / "5/deep/c.npy"]
+    assert len(files.find_files(root, "*.npy", "*.txt")) == 3
+    with pytest.raises(FileNotFoundError):
+        files.find_files(tmp_path / "none", "*")
+
+
+def test_the_home_folder_is_replaced(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    files.write_json("~/new/a.json", [1])
+    assert files.read_json("~/new/a.json") == [1]
+    assert (tmp_path / "new/a.json").is_file()
+    assert files.as_path("a/~/b") == pathlib.Path("a/~/b")
+    with pytest.raises(UserError, match="~no_such_user/x: there is no home folder"):
+        files.as_path("~no_such_user/x")

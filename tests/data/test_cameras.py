@@ -131,3 +131,24 @@ def test_left_half_of_the_stereo_pair(tmp_path):
     (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:44])
     with pytest.raises(DataError, match=r"a\.png: corrupted"):
         read_left_image(tmp_path / "a.png", resize=True)
+
+
+def test_gray_levels_of_16_bits_are_divided_by_256(tmp_path):
+    levels = (np.arange(64 * 32).reshape(32, 64) * 32).astype(np.uint16)
+    Image.fromarray(levels).save(tmp_path / "a.png")
+    found = read_left_image(tmp_path / "a.png", (32, 64))
+    np.testing.assert_array_equal(found, np.repeat(levels[..., None] >> 8, 3, -1))
+    assert len(np.unique(found)) == 256
+
+
+@pytest.mark.parametrize("is_pair", [False, True])
+def test_the_size_of_the_calibration_tells_pairs_from_wide_images(tmp_path, is_pair):
+    wide = dataclasses.replace(CALIBRATION, width=1408, height=376)
+    (tmp_path / "cam.yml").write_text(wide.to_kradar_text())
+    pixels = np.zeros((376, 1408 * (1 + is_pair), 3), np.uint8)
+    pixels[:, :704] = 255  # half of a single image
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    frame = _Frame("1/0", tmp_path / "a.png", tmp_path / "cam.yml")
+    inputs = camera_inputs([frame], (47, 176), CameraOptions(resize=True))
+    assert inputs.image(0).mean(axis=(0, 2)).tolist() == [255.0] * 88 + [0.0] * 88
+    assert inputs.cameras[0].size_px.tolist() == [176, 47]

@@ -169,6 +169,18 @@ def test_values_that_are_no_power_are_named(tmp_path, tesseract, layout):
         check_tesseract(path, deep=True)
 
 
+def test_a_shape_of_unsigned_integers(tmp_path, tesseract):
+    path = tmp_path / "t.mat"
+    write(path, tesseract, "plain")
+    content = path.read_bytes()
+    tag, shape = struct.pack("<I", 16), struct.pack("<4i", *tesseract.shape)
+    assert content.count(struct.pack("<I", 5) + tag + shape) == 1
+    unsigned = struct.pack("<I", 6) + tag + shape
+    path.write_bytes(content.replace(struct.pack("<I", 5) + tag + shape, unsigned))
+    np.testing.assert_array_equal(scipy.io.loadmat(path)["arrDREA"], tesseract)
+    np.testing.assert_array_equal(read_tesseract(path), tesseract)
+
+
 def test_wrong_content_is_named(tmp_path, tesseract):
     path = tmp_path / "t.mat"
     scipy.io.savemat(path, {"arrREA": np.ones((2, 2))})

@@ -213,3 +213,29 @@ def test_impossible_cameras_name_the_file(tmp_path, key, value, message):
     path.write_bytes(b"\xff")
     with pytest.raises(DataError, match=r"cam_1\.yml:1: expected 'key: number'"):
         CameraCalibration.from_kradar(path)
+
+
+def test_angles_of_the_calibration_tool_are_relative(tmp_path):
+    # K-Radar's cam_calib/from_gui_tool/cam_front0.yml; the second pose is the same in the
+    # angles of cam_calib/common/cam_front0.yml.
+    given = {"yaw_deg": 0.6, "pitch_deg": 1.4, "roll_deg": -0.4}
+    same = {"yaw_deg": 88.59992326, "pitch_deg": 0.59982089, "roll_deg": 89.61465984}
+    path = tmp_path / "cam_front0.yml"
+    numbers = dict.fromkeys(("k1", "k2", "k3", "k4", "k5", "z_ldr2cam"), 0.0)
+    numbers |= {"fx": 567.72, "fy": 577.21, "px": 628.72, "py": 369.31}
+    numbers |= {"x_ldr2cam": 0.18, "y_ldr2cam": -0.13}
+    numbers |= {k.replace("_deg", "_ldr2cam"): value for k, value in given.items()}
+    path.write_text("\n".join(f"{name}: {value}" for name, value in numbers.items()))
+    found = CameraCalibration.from_kradar(path)
+    wanted = forward_camera(**same)
+    np.testing.assert_allclose(found.rotation, wanted.rotation, atol=1e-9)
+    _, depth_m = found.project_ego(np.array([20.0, 0.0, 0.0]))
+    assert depth_m == pytest.approx(22.53, abs=0.01)
+    found.require_view_ahead(path)
+
+
+@pytest.mark.parametrize("yaw_deg", [270, 180, 0])
+def test_a_camera_that_sees_nothing_ahead_is_named(yaw_deg):
+    forward_camera().require_view_ahead("cam.yml")
+    with pytest.raises(DataError, match=r"cam\.yml: not the calibration of a front"):
+        forward_camera(yaw_deg=yaw_deg).require_view_ahead("cam.yml")

@@ -200,6 +200,26 @@ def test_decibels_are_warned_of(detector, tesseracts, projections, caplog):
     assert detector.num_invalid_frames == 5
 
 
+def test_arrays_of_other_kinds(detector, tesseracts):
+    wanted = np.asarray(detector(tesseracts[:2]).boxes)
+    masked = np.ma.masked_less(tesseracts[:2], 0)  # nothing is masked
+    for kind in (
+        tesseracts[:2].astype(">f4"),
+        masked,
+        list(tesseracts[:2].astype("O")),
+    ):
+        np.testing.assert_array_equal(detector(kind).boxes, wanted)
+    masked[0, 0, 0, 0, 0] = np.ma.masked
+    for wrong, message in (
+        (masked, "frames: 1 values are masked"),
+        (tesseracts[:2] > 0, "frames: array of bool, expected real numbers"),
+        (tesseracts[:2] * 1j, "array of complex64"),
+        (np.full(tesseracts.shape, "x", object), "array of object"),
+    ):
+        with pytest.raises(UserError, match=message):
+            detector(wrong)
+
+
 def test_arguments_by_name_and_wrong_ones():
     detector = small.detector(roi="narrow")
     assert tuple(detector.decode_options["roi"]) == tuple(NARROW_ROI)
@@ -209,6 +229,7 @@ def test_arguments_by_name_and_wrong_ones():
         ({"batch_sizes": (0,)}, r"batch_sizes is \(0,\), expected integers of"),
         ({"batch_sizes": ()}, r"batch_sizes is \(\), expected"),
         ({"nms_iou": 1.5}, r"nms_iou is 1.5, expected a number"),
+        ({"score_threshold": np.nan}, r"score_threshold is nan, expected a number"),
     ):
         with pytest.raises(UserError, match=message):
             small.detector(**wrong)

@@ -156,6 +156,15 @@ def test_an_exported_radar_model_gives_the_same_boxes(tmp_path):
     assert load_model(tmp_path).config.to_json() == detector.saved.config.to_json()
 
 
+def test_weights_that_are_not_finite_are_an_error(tmp_path):
+    model = small.saved()
+    params = jax.tree.map(np.array, model.variables["params"])
+    jax.tree.leaves(params)[3][...] = np.nan
+    save_model(dataclasses.replace(model, variables={"params": params}), tmp_path)
+    with pytest.raises(DataError, match=r"params/.* has values that are not finite"):
+        load_model(tmp_path)
+
+
 def test_a_model_stored_in_half_is_half_and_computes_in_float32(tmp_path):
     for half in (False, True):
         save_model(small.saved(), tmp_path / str(half), half=half)

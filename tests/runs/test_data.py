@@ -90,7 +90,14 @@ def test_frames_are_projected_beside_their_data_once(
     config.train.batch_size = 5
     with pytest.raises(UserError, match="4 frames are fewer than one batch"):
         _open(config)
+    config = _config("sim", visibility=())
+    config.train.batch_size = 4
+    with pytest.raises(
+        UserError, match="4 frames of the train split have no object of"
+    ):
+        _open(config)
     assert not (root / "records").exists()
+    config = _config("sim")
     config.train.batch_size = 4
     data = _open(config)
     assert data.options.roots == (str(root),)

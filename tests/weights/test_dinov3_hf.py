@@ -136,6 +136,16 @@ def test_incomplete_or_corrupted_folders(folder, tmp_path):
     weights.write_bytes(b"")
     with pytest.raises(DataError, match="is not valid JSON"):
         dinov3_hf.load(folder)
+    (folder / "model.safetensors.index.json").touch()
+    with pytest.raises(UserError, match="has its weights in several files"):
+        dinov3_hf.load(folder)
+    (folder / "model.safetensors.index.json").unlink()
+    (folder / "config.json").write_text('{"architecture": "vit_small_patch16_dinov3"}')
+    safetensors.numpy.save_file(
+        {"blocks.0.attn.qkv.weight": np.zeros((3, 1), np.float32)}, weights
+    )
+    with pytest.raises(UserError, match="has the names of timm or of Meta's code"):
+        dinov3_hf.load(folder)
     (folder / "config.json").write_text("[1]")
     with pytest.raises(DataError, match=r"config.json: expected a JSON object"):
         dinov3_hf.load(folder)

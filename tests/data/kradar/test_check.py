@@ -1,3 +1,4 @@
+import errno
 import json
 import shutil
 
@@ -7,7 +8,7 @@ import pytest
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
 from radejax.data.dataset import Summary
-from radejax.data.kradar import KRadar, write
+from radejax.data.kradar import KRadar, check, write
 from radejax.data.kradar.check import HealthReport, check_dataset
 
 
@@ -75,6 +76,16 @@ def test_deep_reads_what_the_head_does_not_say(root):
     assert check_dataset(root).num_problems == 0
     report = check_dataset(root, deep=True)
     assert report.summary.problem_counts() == {"tesseract corrupted": 1}
+
+
+def test_a_file_that_cannot_be_read_is_not_corrupted(root, monkeypatch):
+    def fail(path, **_):
+        raise OSError(errno.EIO, "Input/output error", str(path))
+
+    monkeypatch.setattr(check, "check_tesseract", fail)
+    report = check_dataset(root)
+    assert report.summary.problem_counts() == {"tesseract not readable": 12}
+    assert report.sequences[0]["tesseracts_corrupted"] == 0
 
 
 def test_a_part_that_is_not_there_is_wrong_use_and_no_clean_bill(root):

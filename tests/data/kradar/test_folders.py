@@ -276,3 +276,30 @@ def test_missing_files_have_defaults_and_are_counted(tmp_path):
     data = KRadar(labels=tmp_path)
     assert not data.summary().problems
     assert data.counts["sequences with the default calibration"] == 1
+
+
+def test_other_spellings_of_the_same_frames(tmp_path):
+    touch(tmp_path / "root/05/info_label/4_1.txt", HEADER)
+    touch(tmp_path / "root/split/train.txt", "05,4_1.txt")
+    data = KRadar(tmp_path / "root", split="train")
+    assert [frame.key for frame in data] == ["5/00004_00001"]
+    touch(tmp_path / f"root/05/info_label/{LABEL}.txt", HEADER)
+    with pytest.raises(DataError, match=rf"frame 5/{LABEL} is there twice, as"):
+        KRadar(tmp_path / "root")
+
+
+def test_an_archive_of_another_system(tmp_path):
+    path = tmp_path / "labels.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(f"labels\\7\\{LABEL}.txt", HEADER)
+        archive.writestr(f"__MACOSX/labels/7/._{LABEL}.txt", "x")
+        archive.writestr("labels/7/.DS_Store", "x")
+    (frame,) = KRadar(labels=path)
+    assert frame.key == f"7/{LABEL}"
+
+
+def test_a_revision_of_links(tmp_path):
+    touch(tmp_path / f"disk/7/{LABEL}.txt", HEADER)
+    (tmp_path / "labels").mkdir()
+    (tmp_path / "labels/7").symlink_to(tmp_path / "disk/7")
+    assert list(dataset.find_labels(tmp_path / "labels")) == [(7, LABEL)]
