@@ -302,9 +302,7 @@ def _parse(file: BinaryIO, head: bytes) -> tuple[str, Layout | None]:
     if (kind, flags_kind, flags_size) != (_MATRIX, _UINT32, 8):
         raise _corrupted(file, f"a variable begins with types {kind}, {flags_kind}")
     dims_kind, dims_size, at, after = _tag(head, after)
-    shape = struct.unpack_from(
-        f"<{dims_size // 4}{'iI'[dims_kind == _UINT32]}", head, at
-    )
+    shape = struct.unpack_from(f"<{dims_size // 4}I", head, at)
     name_kind, name_size, at, after = _tag(head, after)
     name = head[at : at + name_size].decode("ascii", "replace")
     # MATLAB writes int32 shapes; uint32 shapes of other programs are read too.
