@@ -99,7 +99,6 @@ def set_up_jax() -> None:
     """
     import jax
     from absl import flags
-    from absl import logging as absl_logging
 
     log = logging.getLogger("radejax")
     if not log.handlers:
@@ -108,8 +107,6 @@ def set_up_jax() -> None:
         log.addHandler(handler)
         log.setLevel(logging.INFO)
         log.propagate = False
-    # Orbax logs every step. Its log is not needed, as its errors are also raised.
-    absl_logging.set_verbosity(absl_logging.FATAL)
     flags.FLAGS.mark_as_parsed()  # grain's worker processes read an absl flag
     if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):  # JAX reads the variable itself
         # Without a home folder, `expanduser` leaves "~", and programs are not cached.

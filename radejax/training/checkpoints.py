@@ -20,6 +20,7 @@ from typing import Any
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
+from absl import logging as absl_logging
 from jax.experimental import multihost_utils
 from orbax.checkpoint import checkpoint_managers as policies
 
@@ -28,6 +29,9 @@ from radejax.core.errors import DataError, one_line
 from radejax.training import distributed
 
 _log = logging.getLogger(__name__)
+
+# Orbax logs what it does and raises its errors too, so that its log is not needed.
+absl_logging.get_absl_logger().addFilter(lambda record: "orbax" not in record.pathname)
 
 _BEST = "best"  # name of the metric that decides which checkpoint is best
 _VARIABLES = ("params", "ema_params", "model_state")
