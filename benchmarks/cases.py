@@ -53,7 +53,7 @@ def tpm(machine):
         error=difference(
             [project_tensor(tesseract)], [inputs.project_released(tesseract)]
         ),
-        note="beside a plain read: the share of its bandwidth",
+        note="share of the bandwidth of a plain read",
     )
     if machine["platform"] != "cpu":
         x = jax.device_put(np.ascontiguousarray(tesseract)[None])

@@ -47,11 +47,11 @@ def keep(name, number):
 
 def table(results):
     """Returns a Markdown table with the number of inputs per reader and outcome."""
-    lines = ["| reader | inputs | read | refused | wrong |", "|---|---|---|---|---|"]
+    lines = ["| reader | inputs | read | rejected | wrong |", "|---|---|---|---|---|"]
     for name, (counts, wrong) in results.items():
-        refused = counts.total() - counts["read"] - len(wrong)
+        rejected = counts.total() - counts["read"] - len(wrong)
         cells = (
-            f"{n:,}" for n in (counts.total(), counts["read"], refused, len(wrong))
+            f"{n:,}" for n in (counts.total(), counts["read"], rejected, len(wrong))
         )
         lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines)
@@ -60,7 +60,11 @@ def table(results):
 def main(argv=None):
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--minutes", type=float, default=30.0)
-    parser.add_argument("--readers", default="", help="words of their names, by commas")
+    parser.add_argument(
+        "--readers",
+        default="",
+        help="parts of the names of readers, separated by commas",
+    )
     parser.add_argument("--start", type=int, default=0, help="first input's number")
     parser.add_argument("--out", type=pathlib.Path)
     parser.add_argument("--keep", help="READER:NUMBER of an input for the corpus")

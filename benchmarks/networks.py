@@ -140,7 +140,7 @@ def step_of(config, model, variables, batch, precision):
     return run, cost
 
 
-NO_LOSSES = "ours with the losses, torch's with a mean square in their place"
+NO_LOSSES = "ours with the losses, torch's with a mean square instead"
 
 
 # Cases -------------------------------------------------------------------------------
@@ -190,7 +190,7 @@ def radenet_training(machine):
             columns=columns,
             frames=size,
             dtype=dtype,
-            note=NO_LOSSES if remat == "none" else f"rematerialisation: {remat}",
+            note=NO_LOSSES if remat == "none" else f"rematerialization: {remat}",
             **cost,
         )
 

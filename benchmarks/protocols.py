@@ -65,7 +65,7 @@ def main() -> None:
         for name in ("kradar_r40", "coco101", "all_point")
         for cut in (0.0, 0.3)
     }
-    show("Score cuts, AP 3d, IoU 0.3", data, rows)
+    show("Score thresholds, 3D AP, IoU 0.3", data, rows)
     rain = weather == "rain"
     rows = {
         name: {"protocol": name, "spaces": "3d", "weights": rain} for name in PROTOCOLS

@@ -55,7 +55,7 @@ def lens_of_frames(root, frames):
     """Returns the lens cover of each frame in the frame table of a procedural dataset."""
     marker = pathlib.Path(root) / MARKER
     if not marker.exists():
-        raise UserError(f"{root} is no simulated dataset: {MARKER} is missing")
+        raise UserError(f"{root} is not a simulated dataset: {MARKER} is missing")
     simulation = files.read_json(marker)["config"]
     if simulation["scenes"] != "procedural":
         raise UserError(f"{root}: the lens is known of procedural scenes only")
@@ -148,11 +148,17 @@ def rows_of_group(name, reports, config, chosen, resamples):
 @click.command()
 @click.argument("fusion", type=click.Path(exists=True, path_type=pathlib.Path))
 @click.argument("radar", type=click.Path(exists=True, path_type=pathlib.Path))
-@click.option("--out", type=click.Path(path_type=pathlib.Path), help="Beside FUSION.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=pathlib.Path),
+    help="JSON file to write. Default: next to FUSION.",
+)
 @click.option(
     "--data", type=click.Path(exists=True), help="Another dataset than the runs'."
 )
-@click.option("--split", default="test", show_default=True, help="Or all.")
+@click.option(
+    "--split", default="test", show_default=True, help="Split to evaluate: test or all."
+)
 @click.option("--resamples", default=1000, show_default=True)
 def main(fusion, radar, out, data, split, resamples):
     """Compare the workdirs FUSION and RADAR, which were evaluated on the same split."""

@@ -31,7 +31,7 @@ from radejax.simulation.config import plain
 from radejax.training import distributed, loop
 from radejax.training.step import TrainState
 
-SEED_OFFSET = 1_000_003
+SEED_OFFSET = 2_000_003
 """Offset added to the seed of the scenes, so that a dataset of the same config is held out."""
 
 _log = logging.getLogger(__name__)

@@ -134,7 +134,7 @@ def read_projection_npy(
     if projection_shape is not None and projection.shape != tuple(projection_shape):
         r, a, c = projection_shape
         raise DataError(
-            f"{path}: shape {stored.shape}, the sensor's grid demands {(c, r, a)} "
+            f"{path}: shape {stored.shape}, expected {(c, r, a)} "
             "(Doppler + elevation, range, azimuth)"
         )
     return projection
@@ -171,7 +171,7 @@ def _opened(
         shape, axes = layout.shape, "(Doppler, range, elevation, azimuth)"
         if len(shape) != 4 or shape != tuple(shape_drea or shape):
             raise DataError(
-                f"{path}: {VARIABLE} has shape {shape}, the sensor's grid demands "
+                f"{path}: {VARIABLE} has shape {shape}, expected "
                 f"{shape_drea or 'four axes'} {axes}"
             )
         yield file, layout

@@ -94,7 +94,7 @@ def save(model: RadeNet, variables: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """
     if model.cbam == "paper":
         raise UserError(
-            'the official code has no cbam="paper"; it knows "official" and None'
+            'the official code has no cbam="paper", only "official" and None'
         )
     if (model.input_center, model.input_scale) != (0.0, 1.0):
         # They cannot be merged into the first weights, because zeros are padded after them.

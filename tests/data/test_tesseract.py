@@ -129,7 +129,7 @@ def test_no_more_is_inflated_than_is_claimed(tmp_path):
     path.write_bytes(content[:132] + struct.pack("<I", len(bomb)) + bomb)
     with pytest.raises(DataError, match="does not inflate to"):
         read_tesseract(path)
-    with pytest.raises(DataError, match="grid demands"):
+    with pytest.raises(DataError, match=r"expected \("):
         read_tesseract(path, shape_drea=SHAPE)
 
 
@@ -187,16 +187,14 @@ def test_wrong_content_is_named(tmp_path, tesseract):
     with pytest.raises(DataError, match=r"no arrDREA in it, only \['arrREA'\]"):
         read_tesseract(path)
     scipy.io.savemat(path, {"arrDREA": np.ones((2, 2))})
-    with pytest.raises(
-        DataError, match=r"shape \(2, 2\), the sensor.s grid demands four"
-    ):
+    with pytest.raises(DataError, match=r"shape \(2, 2\), expected four"):
         project_file(path)
     scipy.io.savemat(path, {"arrDREA": tesseract * 1j})
     with pytest.raises(DataError, match="flags 0x807, expected real"):
         read_tesseract(path)
     write(path, tesseract, "plain")
     for read in (read_tesseract, project_file, check_tesseract):
-        with pytest.raises(DataError, match=r"grid demands \(1, 2, 3, 4\)"):
+        with pytest.raises(DataError, match=r"expected \(1, 2, 3, 4\)"):
             read(path, shape_drea=(1, 2, 3, 4))
         with pytest.raises(FileNotFoundError, match=r"none\.mat"):
             read(tmp_path / "none.mat")

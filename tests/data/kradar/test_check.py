@@ -61,7 +61,7 @@ def test_everything_that_is_wrong_is_named(root):
     }
     text = report.to_text()
     assert "tesseract_00005.mat: truncated" in text
-    assert "tesseract_00007.mat: arrDREA has shape (2, 3, 4, 5), the sensor's" in text
+    assert "tesseract_00007.mat: arrDREA has shape (2, 3, 4, 5), expected" in text
     assert "frame difference 9, but radar minus LiDAR" in text
     assert "1/00004_00001: the first of 1 frames that are in both" in text
     assert report.sequences[0]["tesseracts_corrupted"] == 2
