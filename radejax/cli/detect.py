@@ -101,6 +101,13 @@ def detect(
     help="Fixed batch size of the program. Default: any (stablehlo), 1 (onnx).",
 )
 @click.option(
+    "--input",
+    "radar_input",
+    type=click.Choice(["projection", "tensor"]),
+    default="projection",
+    help="Radar data with which the program begins.",
+)
+@click.option(
     "--half", is_flag=True, help="Store weights as float16 (huggingface only)."
 )
 def export(

@@ -7,6 +7,7 @@ The programs run without radejax. Folders of all formats contain `config.json` a
 from __future__ import annotations
 
 import dataclasses
+import json
 import logging
 import pathlib
 import warnings
@@ -21,6 +22,7 @@ from flax import traverse_util
 from radejax.core import files
 from radejax.core.errors import UserError, require
 from radejax.core.structures import to_float
+from radejax.data.projection import project_jax
 from radejax.geometry.camera import Camera
 from radejax.inference import exported_loader
 from radejax.inference.detector import SETTINGS, Detector, placeholder
@@ -31,9 +33,14 @@ PLATFORMS = ("cpu", "cuda", "tpu")
 KNOWN_PLATFORMS = (*PLATFORMS, "rocm")
 FORMATS = ("stablehlo", "onnx", "huggingface")
 PROGRAM_FILE = "detector.stablehlo"
+BYTECODE_FILE = "detector.mlirbc"
+INPUTS_FILE = "inputs.json"
 
 CHUNK_SIZE = 1024
 """Default chunk size of the deformable attention in ONNX files, in bins."""
+
+INPUTS = ("projection", "tensor")
+"""Radar data with which a program begins: projections, or tensors that it projects."""
 
 RESULTS = ("boxes", "scores", "classes", "is_valid", "num_truncated")
 
@@ -46,11 +53,30 @@ tags: [radar, 4d-radar, 3d-object-detection, k-radar, jax, flax]
 # {name}: 3D object detection in 4D radar tensors
 
 - Classes: {classes}
-- Input: projections [B, {shape}]; docs/deploy.md of radejax describes inputs, outputs and
-  files
-- Use: `radejax.Detector.from_workdir(folder)`
+- Use: `radejax.Detector.from_workdir(folder)`; docs/deploy.md of radejax has other ways
 - Left out: {left_out}
 - {origin}
+
+## Input
+
+Projections [B, {shape}] float32: range, azimuth (bin 0 is the leftmost), then the Doppler
+channels and the elevation channels. For linear power p, a Doppler channel is the maximum over
+elevation and an elevation channel the maximum over Doppler, as
+(10 log10(p + 1e-10) + 1.2) / 184.3. Programs exported with `--input tensor` take the power
+[B, {tensor}] instead (Doppler, range, elevation, azimuth) and compute the projection.
+`inputs.json` lists the arrays of a program with one batch size.
+
+## Output
+
+Boxes [B, K, 7]: x (ahead), y (left), z (up) of the center, length, width and height in meters,
+and yaw in radians, counter-clockwise from x, in the frame of the radar, with z from the LiDAR.
+Scores [B, K] are sigmoids, classes [B, K] indices into the list above, and `is_valid` [B, K] is
+true for a detection. Programs contain network, decoding (maxima of 3 x 3 bins, score threshold)
+and rotated NMS, but no check of the values: NaN gives no detections.
+
+`network.onnx` ends before the decoding. Its `heatmap_logits` [B, R, A, C] become scores by a
+sigmoid. Its `box_params` [B, R, A, 8] are dx and dy from the center of the bin to that of the
+box, z, length, width, height in meters, sin yaw and cos yaw.
 """
 _LEFT_OUT = (
     "the frozen DINOv3 weights, whose license restricts redistribution: download them "
@@ -71,6 +97,7 @@ def export(
     with_backbone: bool = False,
     batch_size: int | None = None,
     half: bool = False,
+    radar_input: str = "projection",
 ) -> dict[str, Any]:
     """Write a folder with the model; existing files of the same names are replaced.
 
@@ -87,6 +114,7 @@ def export(
         batch_size: Number of frames per call; None means any number with StableHLO, and 1
             with ONNX.
         half: Store the weights as float16; only with "huggingface".
+        radar_input: Radar data with which the program begins, from `INPUTS`.
 
     Returns:
         "bytes", the size of all files in the folder, and "left_out", the names of the
@@ -102,14 +130,15 @@ def export(
     require(is_known, "platforms", platforms, f"some of {KNOWN_PLATFORMS}")
     if half and kind != "huggingface":
         raise UserError("--half is only supported with --format huggingface")
+    require(radar_input in INPUTS, "input", radar_input, f"one of {INPUTS}")
     folder = files.as_path(folder)
     programs: dict[str, bytes] = {}
+    grid, is_tensor = detector.grid, radar_input == "tensor"
+    shape = grid.shape_drea if is_tensor else grid.projection_shape
     if kind == "stablehlo":
-        programs[PROGRAM_FILE] = _stablehlo(
-            detector, platforms, batch_size, with_backbone
-        )
+        programs = _stablehlo(detector, shape, platforms, batch_size, with_backbone)
     elif kind == "onnx":
-        programs = _onnx_files(detector, batch_size or 1, with_backbone)
+        programs = _onnx_files(detector, shape, batch_size or 1, with_backbone)
     content = save_model(
         detector.saved,
         folder,
@@ -128,13 +157,14 @@ def export(
 
 
 def _readme(detector: Detector, left_out: Sequence[str]) -> str:
-    """Return the text of the model card, which refers to docs/deploy.md for details."""
+    """Return the text of the model card."""
     config = detector.saved.config
     is_simulated = (config.get("simulation") or {}).get("scenes") == "procedural"
     return _README.format(
         name={"radenet": "RADE-Net", "dinorade": "DinoRADE"}[config.model.name],
         classes=", ".join(detector.classes),
         shape=", ".join(map(str, detector.grid.projection_shape)),
+        tensor=", ".join(map(str, detector.grid.shape_drea)),
         left_out=_LEFT_OUT if left_out else "nothing",
         origin=_SIMULATED if is_simulated else _MEASURED,
     )
@@ -148,17 +178,18 @@ def _array(*shape: Any, dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
 
 
 def _exported(
-    detector: Detector, batch: Any, with_backbone: bool
+    detector: Detector, shape: Sequence[int], batch: Any, with_backbone: bool
 ) -> tuple[dict[str, Any], tuple[Any, ...]]:
     """Return the variables of a program and the shapes of its inputs.
 
-    The inputs are projections and, for a radar-camera model, images and a dictionary of
-    the camera's fields. Without the image transformer, the images are embedded ones.
+    The inputs are projections or tensors and, for a radar-camera model, images and a
+    dictionary of the camera's fields. Without the image transformer, the images are
+    embedded ones.
     """
     variables = {name: dict(tree) for name, tree in detector.variables.items()}
-    projection = _array(batch, *detector.grid.projection_shape)
+    radar = _array(batch, *shape)
     if not detector.takes_camera:
-        return variables, (projection,)
+        return variables, (radar,)
     model = detector.model
     image, camera = jax.tree.map(
         lambda x: _array(batch, *x.shape[1:], dtype=x.dtype), placeholder(1, model)
@@ -166,7 +197,45 @@ def _exported(
     if not (with_backbone or model.vit is None):
         variables["params"].pop(IMAGE_BACKBONE, None)
         image = _array(batch, *model.feature_shape)
-    return variables, (projection, image, vars(camera))
+    return variables, (radar, image, vars(camera))
+
+
+def _names(shapes: Sequence[Any]) -> list[str]:
+    """Return the names of the leaves of the inputs that `_exported` returns."""
+    radar = "projection" if len(shapes[0].shape) == 4 else "tensor"
+    names = [radar, "image"][: len(shapes)]
+    return names + [f"camera_{n}" for n in sorted(shapes[2])] if shapes[2:] else names
+
+
+_UNITS = {
+    "projection": "(10 log10(power + 1e-10) + 1.2) / 184.3",
+    "tensor": "linear power",
+    "image": "RGB of 0 to 255 (uint8), or features of the image backbone (float32)",
+    "camera_cam_from_ego": "rotation and translation in m from the radar frame",
+    "camera_distortion": "k1, k2, p1, p2, k3",
+    "camera_intrinsics": "fx, fy, cx, cy in pixels",
+    "camera_is_valid": "whether the frame has an image",
+    "camera_max_radius": "tangent of the viewing angle",
+    "camera_size_px": "width, height in pixels",
+    "score_threshold": "0 to 1",
+    "nms_iou": "0 to 1",
+    "roi": "x0, x1, y0, y1, z0, z1 in m",
+}
+
+
+def _described(names: Sequence[str], arrays: Sequence[Any]) -> bytes:
+    """Return the content of `inputs.json`: a list of inputs in the order of a program."""
+    rows = [
+        {
+            "index": index,
+            "name": name,
+            "shape": list(x.shape),
+            "dtype": str(x.dtype),
+            "unit": _UNITS.get(name, "weights: the tensor in model.safetensors"),
+        }
+        for index, (name, x) in enumerate(zip(names, arrays, strict=True))
+    ]
+    return json.dumps(rows, indent=1).encode()
 
 
 def _detect(
@@ -183,17 +252,20 @@ def _detect(
 
 def _stablehlo(
     detector: Detector,
+    shape: Sequence[int],
     platforms: Sequence[str],
     batch_size: int | None,
     with_backbone: bool,
-) -> bytes:
-    """Return the serialized program from weights, inputs and settings to detections.
+) -> dict[str, bytes]:
+    """Return the program from weights, inputs and settings to detections, in files.
 
     The result of the program is a dictionary of arrays. The batch size is symbolic if
-    `batch_size` is None. Without the backbone, the images are embedded ones.
+    `batch_size` is None. Without the backbone, the images are embedded ones. With a batch
+    size and a single platform, the bytecode and `inputs.json` are returned too, from
+    which other languages can run the program.
     """
     batch = batch_size or jax.export.symbolic_shape("b")[0]
-    variables, inputs = _exported(detector, batch, with_backbone)
+    variables, inputs = _exported(detector, shape, batch, with_backbone)
     flat = traverse_util.flatten_dict(variables, sep="/")
 
     def program(weights: Any, inputs: Any, *settings: Any) -> dict[str, jax.Array]:
@@ -205,13 +277,22 @@ def _stablehlo(
     exported = jax.export.export(jax.jit(program), platforms=tuple(platforms))(
         weights, inputs, *settings
     )
-    return bytes(exported.serialize())
+    contents = {PROGRAM_FILE: bytes(exported.serialize())}
+    if batch_size and len(platforms) == 1:
+        names = [*sorted(weights), *_names(inputs), *SETTINGS]
+        kept = (
+            exported.module_kept_var_idx
+        )  # inputs that the program does not use are cut
+        used = [(names[i], exported.in_avals[i]) for i in kept]
+        contents[BYTECODE_FILE] = exported.mlir_module_serialized
+        contents[INPUTS_FILE] = _described(*zip(*used, strict=True))
+    return contents
 
 
 def _onnx_files(
-    detector: Detector, batch_size: int, with_backbone: bool
+    detector: Detector, shape: Sequence[int], batch_size: int, with_backbone: bool
 ) -> dict[str, bytes]:
-    """Return the contents of the ONNX files by name.
+    """Return the contents of the ONNX files and of `inputs.json` by name.
 
     `network.onnx` contains the network, and `detector.onnx` also decoding and rotated NMS.
 
@@ -236,15 +317,15 @@ def _onnx_files(
         config = detector.saved.config.copy_and_resolve_references()
         config.model.fusion.chunk_size = config.model.fusion.chunk_size or CHUNK_SIZE
         detector = Detector(dataclasses.replace(detector.saved, config=config))
-    variables, shapes = _exported(detector, batch_size, with_backbone)
+    variables, shapes = _exported(detector, shape, batch_size, with_backbone)
     leaves, tree = jax.tree.flatten(shapes)
-    names = ["projection", "image"][: len(shapes)]
-    names += [f"camera_{name}" for name in sorted(shapes[2])] if shapes[2:] else []
+    names = _names(shapes)
 
     def network(*arrays: jax.Array) -> list[jax.Array]:
-        projection, *rest = jax.tree.unflatten(tree, arrays)
+        radar, *rest = jax.tree.unflatten(tree, arrays)
         camera = [rest[0], Camera(**rest[1])] if rest else []
-        inputs = to_float(projection), *camera
+        projection = project_jax(radar) if radar.ndim == 5 else to_float(radar)
+        inputs = projection, *camera
         maps: Any = detector.model.apply(variables, *inputs, train=False)
         return [maps.heatmap_logits, maps.box_params]
 
@@ -268,4 +349,7 @@ def _onnx_files(
         return {
             "network.onnx": convert(network, {}, ("heatmap_logits", "box_params")),
             "detector.onnx": convert(program, SETTINGS, RESULTS),
+            INPUTS_FILE: _described(
+                [*names, *SETTINGS], [*leaves, *(_array(*s) for s in SETTINGS.values())]
+            ),
         }

@@ -2,17 +2,22 @@
 
 import json
 import os
+import pathlib
 import subprocess
 import sys
+from types import SimpleNamespace
 from typing import Any
 
 import jax
 import numpy as np
 import pytest
+from jax.extend import backend
+from jaxlib import _jax as jaxlib_client
 
 from radejax import Detector, UserError
+from radejax.core.structures import MIN_SIZE_M
 from radejax.geometry.camera import stack_cameras
-from radejax.inference import export
+from radejax.inference import export, exported_loader
 
 from .. import small_models as small
 
@@ -126,6 +131,45 @@ def test_a_program_of_one_batch_size_and_platform_has_static_shapes(tmp_path):
     text = exported.mlir_module()
     assert "dynamic_broadcast" not in text
     assert "_platform_index" not in text
+    # The bytecode alone gives the same boxes, with the inputs that are listed.
+    rows = json.loads((tmp_path / "inputs.json").read_text())
+    assert [row["index"] for row in rows] == list(range(len(rows)))
+    names = ["projection", "score_threshold", "nms_iou", "roi"]
+    assert [row["name"] for row in rows[-4:]] == names
+    projection = small.projections(2)
+    given = dict(
+        exported_loader.read_weights((tmp_path / "model.safetensors").read_bytes())
+    )
+    given |= dict(zip(names, (projection, 0.1, 0.3, (-99, 99) * 3), strict=True))
+    inputs = [np.asarray(given[row["name"]], row["dtype"]) for row in rows]
+    assert [list(x.shape) for x in inputs] == [row["shape"] for row in rows]
+    found = _run_bytecode((tmp_path / "detector.mlirbc").read_bytes(), inputs)
+    wanted = detector(projection, roi=(-99, 99) * 3)
+    for name, value in zip(sorted(export.RESULTS), found, strict=True):
+        np.testing.assert_allclose(value, getattr(wanted, name), atol=1e-4)
+
+
+def _run_bytecode(program, inputs):
+    """Compile and run StableHLO bytecode through PJRT, without `jax.export`."""
+    options = backend.get_compile_options(num_replicas=1, num_partitions=1)
+    devices = jaxlib_client.DeviceList(tuple(jax.devices("cpu")[:1]))
+    loaded = backend.get_backend("cpu").compile_and_load(program, devices, options)
+    results = loaded.execute_sharded([jax.device_put(x) for x in inputs])
+    return [np.asarray(x[0]) for x in results.disassemble_into_single_device_arrays()]
+
+
+def test_a_program_that_begins_with_the_tensor(tmp_path):
+    detector, rng = small.detector(), np.random.default_rng(0)
+    tensors = 10 ** rng.uniform(2, 15, (1, *detector.grid.shape_drea))
+    options = {"platforms": ("cpu",), "batch_size": 1, "radar_input": "tensor"}
+    export.export(detector, tmp_path, **options)
+    found = exported_loader.load(tmp_path)(tensors.astype(np.float32))
+    wanted = detector(tensors.astype(np.float32))
+    assert wanted.is_valid.any()
+    np.testing.assert_allclose(found["boxes"], wanted.boxes, atol=1e-4)
+    rows = json.loads((tmp_path / "inputs.json").read_text())
+    assert rows[-4]["name"] == "tensor"
+    assert rows[-4]["unit"] == "linear power"
 
 
 @pytest.mark.slow
@@ -196,5 +240,33 @@ def test_onnx_files_give_the_same_boxes(kind, tmp_path):
     maps = jax.jit(lambda v, *x: detector.model.apply(v, *x, train=False))(
         detector.variables, *arguments
     )
+    rows = json.loads((tmp_path / "inputs.json").read_text())
+    session = runtime.InferenceSession(tmp_path / "detector.onnx")
+    assert [row["name"] for row in rows] == [x.name for x in session.get_inputs()]
+    assert [row["shape"] for row in rows] == [x.shape for x in session.get_inputs()]
     for name, values in run("network.onnx", inputs).items():
         np.testing.assert_allclose(values, getattr(maps, name), atol=1e-4)
+
+
+def test_the_documented_decoder_finds_the_boxes_before_nms(tmp_path, monkeypatch):
+    page = pathlib.Path(__file__).parents[2] / "docs" / "deploy.md"
+    blocks = page.read_text(encoding="utf-8").split("```python\n")
+    (code,) = (
+        block.split("```")[0] for block in blocks if "sliding_window_view" in block
+    )
+    detector, projection = small.detector(), small.projections(1)
+    export.export(detector, tmp_path / "onnx", kind="huggingface")
+    monkeypatch.chdir(tmp_path)
+    maps = detector.model.apply(detector.variables, projection, train=False)
+    outputs = [np.asarray(maps.heatmap_logits), np.asarray(maps.box_params)]
+    network = SimpleNamespace(run=lambda *_: outputs)
+    found = {"network": network, "projection": projection}
+    exec(code, found)
+    settings = {"score_threshold": 0.3, "nms_iou": 1.0, "roi": (-99, 99) * 3}
+    wanted = detector(projection, **settings)
+    order = np.argsort(-found["best"], kind="stable")[: wanted.is_valid.sum()]
+    assert len(order) > 3
+    found["boxes"][:, 3:6] = found["boxes"][:, 3:6].clip(MIN_SIZE_M)
+    for name, ours in (("boxes", "boxes"), ("best", "scores"), ("classes", "classes")):
+        expected = np.asarray(getattr(wanted, ours))[0, : len(order)]
+        np.testing.assert_allclose(found[name][order], expected, atol=1e-4)
