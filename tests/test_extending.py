@@ -3,6 +3,8 @@
 import json
 import pathlib
 import re
+import sys
+import types
 from collections.abc import Iterator
 from typing import Any
 
@@ -15,11 +17,12 @@ from PIL import Image
 from radejax import models
 from radejax.core.errors import UserError
 from radejax.data.cameras import CameraOptions
-from radejax.data.dataset import DATA_SETS, data_set
+from radejax.data.dataset import data_set
 from radejax.data.kradar import KRadar
 from radejax.data.pipeline import camera_inputs
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOLS
+from radejax.inference.detect_files import detect_files
 from radejax.losses.detection import LOSSES
 from radejax.models.backbone import BACKBONES
 from radejax.models.heads import HEADS, NECKS
@@ -31,18 +34,18 @@ from . import small_models as small
 from .evaluation.scenes import random_scene
 
 PAGE = pathlib.Path(__file__).resolve().parents[1] / "docs" / "extending.md"
-NAMES = (NECKS, HEADS, BACKBONES, LOSSES, DATA_SETS, PROTOCOLS)
+NAMES = (NECKS, HEADS, BACKBONES, LOSSES, PROTOCOLS)
 BLOCKS = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.MULTILINE | re.S)
 
 
 @pytest.fixture(autouse=True)
-def _page() -> Iterator[None]:
+def _page(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Run the page and remove its registered names afterwards."""
     before = [dict(names) for names in NAMES]
     for number, block in enumerate(BLOCKS):
-        exec(
-            compile(block, f"{PAGE}, block {number + 1}", "exec"), {"__name__": "page"}
-        )
+        module = types.ModuleType("toy" if "class Toy(" in block else "page")
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+        exec(compile(block, f"{PAGE}, block {number + 1}", "exec"), vars(module))
     yield
     for names, kept in zip(NAMES, before, strict=True):
         names.clear()
@@ -54,7 +57,7 @@ def _config() -> ConfigDict:
     config = small.radar_config()
     config.model.update(backbone="flat", neck="strip", heads="wide")
     config.loss.weights.height = 0.5
-    config.data.format = "toy"
+    config.data.format = "toy:Toy"
     config.train.update(batch_size=2, num_epochs=1, warmup_steps=0)
     config.evaluation.update(batch_size=2, num_visualizations=0)
     config.evaluation.protocols = ("all_point",)
@@ -84,11 +87,12 @@ def _write_toy(root: pathlib.Path) -> pathlib.Path:
 
 
 def test_the_page_has_every_kind_of_part() -> None:
-    assert len(BLOCKS) == len(NAMES)
+    assert len(BLOCKS) == len(NAMES) + 1
     for names, name in zip(
-        NAMES, ("strip", "wide", "flat", "height", "toy", "free101"), strict=True
+        NAMES, ("strip", "wide", "flat", "height", "free101"), strict=True
     ):
         assert name in names
+    assert data_set("toy:Toy").__name__ == "Toy"
 
 
 def test_configs_may_name_the_parts_and_the_model_has_them() -> None:
@@ -103,7 +107,7 @@ def test_configs_may_name_the_parts_and_the_model_has_them() -> None:
 
 
 def test_the_toy_data_set_gives_what_a_run_asks(tmp_path: pathlib.Path) -> None:
-    frames = DATA_SETS["toy"]([_write_toy(tmp_path)], classes=("Sedan",))
+    frames = data_set("toy:Toy")([_write_toy(tmp_path)], classes=("Sedan",))
     train = frames.of_split("train")
     assert [frame.key for frame in train] == ["1/0001", "1/0002"]
     assert len(frames.without({"1/0001"}, "test")) == 3
@@ -126,7 +130,7 @@ def test_an_unknown_format_is_named_with_those_that_there_are() -> None:
     config = _config()
     config.data.format = "nuscenes"
     with pytest.raises(
-        UserError, match=r"format is 'nuscenes', expected .*kradar, toy"
+        UserError, match=r"format is 'nuscenes', expected kradar or module:Class"
     ):
         Data(config, models.build(config.model))
 
@@ -140,6 +144,7 @@ def test_all_parts_are_trained_and_evaluated_on_the_toy_data(
     root, folder = _write_toy(tmp_path / "toy"), tmp_path / "run"
     config = _config()
     config.data.roots = (str(root),)
+    config.classes = ("Tram", *config.classes[1:])
     experiment.run(config, folder)
     row: dict[str, Any] = json.loads((folder / "metrics.jsonl").read_text())
     assert row["step"] == 1
@@ -152,7 +157,15 @@ def test_all_parts_are_trained_and_evaluated_on_the_toy_data(
     assert report is not None
     source = json.loads((folder / "evaluation" / "source.json").read_text())
     assert source["roots"] == [str(root)]
-    assert (folder / "evaluation" / "metrics.json").is_file()
+    metrics = json.loads((folder / "evaluation" / "metrics.json").read_text())
+    assert metrics["options"]["classes"][0] == "Tram"
+    assert "labels=" not in json.dumps(metrics)
+    found = detect_files(folder, [root], tmp_path / "boxes", score_threshold=0.0)
+    assert found["frames"] == 4
+    names = sorted(path.name for path in (tmp_path / "boxes").iterdir())
+    assert names == ["1_0001.json", "1_0002.json", "2_0001.json", "2_0002.json"]
+    boxes = json.loads((tmp_path / "boxes" / names[0]).read_text())
+    assert {box["frame"] for box in boxes} == {"1/0001"}
 
 
 def test_a_format_may_name_a_class_of_a_module() -> None:

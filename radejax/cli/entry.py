@@ -134,6 +134,7 @@ class Program(click.Command):
         """Runs the command with the given arguments, by default those of this process."""
         if args is None:
             memory.restart_with_huge_pages()
+            sys.path.append(os.getcwd())  # for `config.data.format=module:Class`
         return super().main(args, *others, **options)
 
 

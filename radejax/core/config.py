@@ -265,7 +265,7 @@ _FIELDS: dict[str, Any] = {
         "max_skipped_steps": 20,
     },
     "data": {
-        # kradar, another name of `radejax.data.dataset.DATA_SETS`, or module:Class.
+        # kradar, or module:Class for another reader.
         "format": "kradar",
         # Folders of the dataset; empty: the dataset that `simulation` describes.
         "roots": (),

@@ -200,30 +200,21 @@ class LabelledFrames(Sequence[_F]):
         return other
 
 
-DATA_SETS: dict[str, str | Callable[..., LabelledFrames]] = {
-    "kradar": "radejax.data.kradar:KRadar"
-}
-"""Readers that `config.data.format` may name, as classes or as "module:Class".
-
-They are called with the roots, the labels and the options of `KRadar`; another reader may
-ignore options that do not apply to it."""
-
-
 def data_set(name: str) -> Callable[..., LabelledFrames]:
     """Returns the reader of a format.
 
+    It is called with the roots, the labels and the options of `KRadar`; another reader may
+    ignore options that do not apply to it.
+
     Args:
-        name: A key of `DATA_SETS`, or "module:Class".
+        name: "kradar", or "module:Class" for another reader.
 
     Raises:
         UserError: There is no such name, or the class cannot be imported.
     """
-    reader = DATA_SETS.get(name, name)
-    if not isinstance(reader, str):
-        return reader
-    module, _, attribute = reader.partition(":")
-    expected = f"{', '.join(DATA_SETS)} or module:Class"
-    require(bool(attribute), "config.data.format", name, expected)
+    name = "radejax.data.kradar:KRadar" if name == "kradar" else name
+    module, _, attribute = name.partition(":")
+    require(bool(attribute), "config.data.format", name, "kradar or module:Class")
     try:
         return getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:

@@ -77,11 +77,11 @@ class Result(Curve):
         For example ap_3d_iou30/kradar_r40/score>0/skip=frame/labels=v2.1/roi=narrow,
         followed by /simulated for simulated frames.
         """
+        labels = f"/labels={self.label_version}" if self.label_version else ""
         return (
             f"ap_{self.space}_iou{100 * self.iou:.4g}/{self.protocol}"
             f"/score>{self.score_threshold:g}/skip={self.empty_frames}"
-            f"/labels={self.label_version or 'unknown'}/roi={self.roi}"
-            + ("/simulated" if self.is_simulated else "")
+            f"{labels}/roi={self.roi}" + ("/simulated" if self.is_simulated else "")
         )
 
 

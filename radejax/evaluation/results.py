@@ -110,9 +110,10 @@ class EvaluationOptions:
                 f"classes has {unknown[0]!r}, expected some of the run's: "
                 f"{', '.join(classes)}"
             )
+        is_own = config.data.format != "kradar"
         values = {
             "classes": classes,
-            "label_version": config.data.label_version,
+            "label_version": None if is_own else config.data.label_version,
             "invalid_sizes": "false_positive",
             **config.evaluation.to_dict(),
             **changes,

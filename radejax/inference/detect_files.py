@@ -10,7 +10,7 @@ import dataclasses
 import json
 import os
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ import tqdm
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.core.structures import Detections, frame_key
+from radejax.data.dataset import data_set
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.conditions import check_weather, read_description
 from radejax.data.kradar.dataset import sequence_number
@@ -177,35 +178,21 @@ def detect_files(
         UserError: There is no frame, two frames would be written to the same file, or an
             image or weight is not as expected.
     """
-    frames = find_frames(paths, sequence_numbers, weather)
-    seen: dict[str, pathlib.Path] = {}
-    for path in frames:
-        if (other := seen.setdefault(output_name(path), path)) is not path:
-            raise UserError(
-                f"{other} and {path} would both be written as "
-                f"{output_name(path)}.json: detect each root into a folder of its own"
-            )
     detector = Detector.from_workdir(source, step, image_backbone=image_backbone)
-    data, out = detector.saved.config.data, files.as_path(out)
-    known: dict[pathlib.Path, tuple[pathlib.Path, Camera]] = {}
-    if detector.takes_camera:
-        labels = labels or data.labels
-        known = front_images(frames, detector, labels, data.label_version)
+    is_kradar = detector.saved.config.data.format == "kradar"
+    read, part = _files if is_kradar else _frames, (sequence_numbers, weather)
+    keys, inputs = read(paths, *part, detector, labels, batch_size)
+    out = files.as_path(out)
     out.mkdir(parents=True, exist_ok=True)
-    keys = [key_of(path) for path in frames]
-    names = [f"{output_name(path)}.json" for path in frames]
+    names = [f"{key.replace('/', '_')}.json" for key in keys]
     if file_format == "kitti":
-        names = [f"preds/{number:06d}.txt" for number in range(len(frames))]
-        table = {"frame": list(range(len(frames))), "name": keys}
+        names = [f"preds/{number:06d}.txt" for number in range(len(keys))]
+        table = {"frame": list(range(len(keys))), "name": keys}
         files.write_json(out / "frames.json", table)
-    batches = [slice(i, i + batch_size) for i in range(0, len(frames), batch_size)]
-    inputs: list[Any] = [frames[batch] for batch in batches]
-    if known:
-        images = [known.get(path.absolute(), (None, None)) for path in frames]
-        inputs = [(frames[b], *zip(*images[b], strict=True)) for b in batches]
+    batches = _batches(keys, batch_size)
     found = detector.stream(inputs, **settings)
-    count = {"frames": len(frames), "boxes": 0, "clipped": 0}
-    with tqdm.tqdm(total=len(frames), desc="detect", unit="frame") as bar:
+    count = {"frames": len(keys), "boxes": 0, "clipped": 0}
+    with tqdm.tqdm(total=len(keys), desc="detect", unit="frame") as bar:
         for batch, detections in zip(batches, found, strict=True):
             texts = _texts(keys[batch], detections, file_format)
             for name, text in zip(names[batch], texts, strict=True):
@@ -216,6 +203,75 @@ def detect_files(
     if detector.takes_camera:
         count["radar_only"] = detector.num_radar_only
     return count
+
+
+def _batches(items: Sequence[Any], batch_size: int) -> list[slice]:
+    return [slice(i, i + batch_size) for i in range(0, len(items), batch_size)]
+
+
+def _files(
+    paths: Sequence[str | os.PathLike],
+    sequence_numbers: Sequence[int] | None,
+    weather: Sequence[str] | None,
+    detector: Detector,
+    labels: str | os.PathLike | None,
+    batch_size: int,
+) -> tuple[list[str], Iterable[Any]]:
+    """Return the keys of K-Radar's frames, and the inputs of the detector in batches."""
+    frames = find_frames(paths, sequence_numbers, weather)
+    seen: dict[str, pathlib.Path] = {}
+    for path in frames:
+        if (other := seen.setdefault(output_name(path), path)) is not path:
+            raise UserError(
+                f"{other} and {path} would both be written as "
+                f"{output_name(path)}.json: detect each root into a folder of its own"
+            )
+    keys, batches = [key_of(path) for path in frames], _batches(frames, batch_size)
+    data = detector.saved.config.data
+    known: dict[pathlib.Path, tuple[pathlib.Path, Camera]] = {}
+    if detector.takes_camera:
+        labels = labels or data.labels
+        known = front_images(frames, detector, labels, data.label_version)
+    if not known:
+        return keys, (frames[batch] for batch in batches)
+    images = [known.get(path.absolute(), (None, None)) for path in frames]
+    return keys, ((frames[b], *zip(*images[b], strict=True)) for b in batches)
+
+
+def _frames(
+    roots: Sequence[str | os.PathLike],
+    sequence_numbers: Sequence[int] | None,
+    weather: Sequence[str] | None,
+    detector: Detector,
+    labels: str | os.PathLike | None,
+    batch_size: int,
+) -> tuple[list[str], Iterable[Any]]:
+    """Return keys and inputs as `_files` does, from the reader of the run's own format."""
+    config = detector.saved.config
+    frames = data_set(config.data.format)(
+        list(map(str, roots)),
+        labels or config.data.labels,
+        classes=config.classes,
+        sequence_numbers=sequence_numbers,
+        weather=weather,
+    )
+    if detector.grid != frames.grid:
+        raise UserError(f"{roots[0]}: the radar has other axes than that of the run")
+    images: list[Any] = []
+    if detector.takes_camera:
+        options = dataclasses.replace(detector.camera_options, allow_missing=True)
+        cameras = camera_inputs(frames, detector.model.image_size, options).cameras
+        images = [
+            (frame.camera_path, camera) if camera.is_valid else (None, None)
+            for frame, camera in zip(frames, cameras, strict=True)
+        ]
+
+    def read(batch: slice) -> Any:
+        radar = np.stack([f.read_projection(frames.grid) for f in frames[batch]])
+        return (radar, *zip(*images[batch], strict=True)) if images else radar
+
+    batches = _batches(frames, batch_size)
+    return [frame.key for frame in frames], map(read, batches)
 
 
 def _texts(keys: Sequence[str], detections: Detections, file_format: str) -> list[str]:

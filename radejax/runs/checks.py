@@ -40,7 +40,6 @@ _SEQUENCES = several(integer(1), "different sequence numbers; () for all")
 # Fields that no constructor checks, or only one that reads data.
 _RUN = {
     "seed": _SEED,
-    "classes": several(one_of(*LABEL_CLASSES), f"different classes of {LABEL_CLASSES}"),
 }
 _DATA = {
     "roots": (all, "folders"),
@@ -110,6 +109,10 @@ def check(config: ConfigDict) -> None:
     check_options(config.train, "config.train", _TRAIN)
     check_options(config.logging, "config.logging", _LOGGING)
     data_set(config.data.format)
+    names, expected = one_of(*LABEL_CLASSES), f"different classes of {LABEL_CLASSES}"
+    if config.data.format != "kradar":
+        names, expected = (lambda name: isinstance(name, str), ""), "different names"
+    check_options(config, "config", {"classes": several(names, expected, least=1)})
     for section, construct in (
         ("model", lambda: models.build(config.model)),
         ("loss", lambda: LossOptions(**config.loss.to_dict())),

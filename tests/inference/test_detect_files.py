@@ -118,8 +118,11 @@ def test_two_frames_of_one_name_are_rejected(tmp_path):
         path = tmp_path / disk / "5" / "radar_tesseract" / "tesseract_00033.mat"
         path.parent.mkdir(parents=True)
         path.touch()
+    save_model(small.saved(), tmp_path / "model")
     with pytest.raises(UserError, match=r"a/5/.* and .*b/5/.* 5_00033.json"):
-        detect_files(tmp_path, [tmp_path / "a", tmp_path / "b"], tmp_path / "out")
+        detect_files(
+            tmp_path / "model", [tmp_path / "a", tmp_path / "b"], tmp_path / "out"
+        )
 
 
 def test_images_of_simulated_folders_are_found(tmp_path):
