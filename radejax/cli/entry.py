@@ -92,11 +92,7 @@ def _message(error: BaseException) -> str:
 
 
 def set_up_jax() -> None:
-    """Sets up logging at level info and JAX's persistent compilation cache.
-
-    Compiled programs are stored in the folder given by the environment variable
-    JAX_COMPILATION_CACHE_DIR, or in the user's cache folder.
-    """
+    """Sets up logging at level info and JAX's persistent compilation cache."""
     import jax
     from absl import flags
 
@@ -108,12 +104,7 @@ def set_up_jax() -> None:
         log.setLevel(logging.INFO)
         log.propagate = False
     flags.FLAGS.mark_as_parsed()  # grain's worker processes read an absl flag
-    if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):  # JAX reads the variable itself
-        # Without a home folder, `expanduser` leaves "~", and programs are not cached.
-        home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-        if os.path.isabs(home):
-            folder = os.path.join(home, "radejax", "jax")
-            jax.config.update("jax_compilation_cache_dir", folder)
+    memory.cache_compiled_programs()
     # Small programs are cached too: compiling the fifty at the start of a run takes a
     # second.
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

@@ -1,4 +1,4 @@
-"""Huge memory pages for the programs of this package."""
+"""Settings of a process: huge memory pages and the cache of compiled programs."""
 
 from __future__ import annotations
 
@@ -12,6 +12,21 @@ _TUNABLES = (
     "glibc.malloc.mmap_threshold=4294967296:"
     "glibc.malloc.trim_threshold=9223372036854775807"
 )
+
+
+def cache_compiled_programs() -> None:
+    """Let JAX store compiled programs in the user's cache folder, unless a folder is set.
+
+    The folder is `radejax/jax` in `XDG_CACHE_HOME` or `~/.cache`. Without a home folder,
+    programs are not stored. JAX itself reads JAX_COMPILATION_CACHE_DIR.
+    """
+    import jax  # `--help` imports this module and must be fast
+
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    is_set = jax.config.values["jax_compilation_cache_dir"]
+    if not is_set and os.path.isabs(home):
+        folder = os.path.join(home, "radejax", "jax")
+        jax.config.update("jax_compilation_cache_dir", folder)
 
 
 def restart_with_huge_pages() -> None:

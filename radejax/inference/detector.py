@@ -23,6 +23,7 @@ from jaxtyping import Bool, Real, Shaped, UInt8
 from radejax import models
 from radejax.core.errors import UserError, require
 from radejax.core.files import PathLike, as_path
+from radejax.core.memory import cache_compiled_programs
 from radejax.core.structures import ROIS, Array, Batch, Detections, to_float
 from radejax.data.cameras import CameraOptions, no_camera, read_left_image
 from radejax.data.projection import (
@@ -155,6 +156,7 @@ class Detector:
             else self.sharding
         )
         self._set_batch_sizes(batch_sizes)
+        cache_compiled_programs()
         self.variables = jax.device_put(saved.variables, self.replicated)
         self.num_radar_only = self.num_invalid_frames = 0
         self._lock = threading.Lock()
@@ -307,6 +309,8 @@ class Detector:
         """Yield the detections of items in order, with up to two items in flight.
 
         The next item is read and prepared while the device processes the current one.
+        Therefore a result is yielded after the next item was requested: for a live sensor,
+        call the detector instead.
 
         Args:
             frames: Items that `__call__` accepts as `frames`, or tuples of the frames,
@@ -321,14 +325,21 @@ class Detector:
                 yield started.pop(0)
         yield from started
 
-    def warmup(self, batch_size: int = 1) -> Detector:
-        """Compile the model for a batch size of projections, so that the first call is fast.
+    def warmup(self, *sample: Any) -> Detector:
+        """Compile the model, so that the first call is fast.
 
-        A radar-camera model is compiled for frames with images.
+        Args:
+            *sample: Arguments of a call like those to come, such as one tesseract; or the
+                batch size of projections (and images, for a radar-camera model), 1 by
+                default.
 
         Returns:
             The detector itself.
         """
+        if sample and not isinstance(sample[0], int):
+            jax.block_until_ready(self(*sample))
+            return self
+        batch_size = sample[0] if sample else 1
         shape = (batch_size, *self.grid.projection_shape)
         inputs: tuple[Any, ...] = (np.zeros(shape, np.float32),)
         if self.takes_camera:

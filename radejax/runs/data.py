@@ -26,6 +26,7 @@ from radejax.data.augment import Augmentation
 from radejax.data.cameras import CameraOptions
 from radejax.data.dataset import FrameSequence, LabelledFrames, data_set
 from radejax.data.kradar.dataset import held_out
+from radejax.data.projection import decode
 from radejax.data.records import Records
 from radejax.inference.saved import SavedModel
 from radejax.runs.checks import check_bins
@@ -33,6 +34,9 @@ from radejax.simulation.dataset import simulate_dataset
 from radejax.training import distributed
 
 _log = logging.getLogger(__name__)
+
+_INPUT_FRAMES = 20
+_KRADAR_INPUT = 0.545  # mean of K-Radar's projections
 
 
 class Data:
@@ -310,6 +314,7 @@ def open_data(config: ConfigDict, model: nn.Module) -> Data:
             "in the field of view: nothing can be learned from them"
         )
     data.preprocess()
+    _log_input(data, config.model)
     if config.data.validation:
         frames = data.split("validation")
         _log.info(
@@ -320,6 +325,23 @@ def open_data(config: ConfigDict, model: nn.Module) -> Data:
             len(data.split("train")),
         )
     return data
+
+
+def _log_input(data: Data, model: ConfigDict) -> None:
+    """Log mean and standard deviation of the input; warn if it is nearly constant."""
+    frames = list(data.split("train"))
+    some = frames[:: -(-len(frames) // _INPUT_FRAMES)]
+    values = np.stack([decode(data.records[frame.key]) for frame in some])
+    mean, spread = float(values.mean()), float(values.std())
+    _log.info("input: %.3f ± %.3f in %d frames to train on", mean, spread, len(some))
+    center, scale = model.get("input_center", 0.0), model.get("input_scale", 1.0)
+    is_unusual = abs(scale * (mean - center) - _KRADAR_INPUT) > 0.1
+    if is_unusual and abs(scale) * spread < 0.05:
+        _log.warning(
+            "the network sees a nearly constant input, other than that of K-Radar "
+            "(%.3f): set --config.model.input_center=%.3f --config.model.input_scale=%.3g",
+            *(_KRADAR_INPUT, mean, 0.5 / max(spread, 1e-6)),
+        )
 
 
 def data_of_run(

@@ -1,7 +1,6 @@
 """One line and an exit code for the user's errors; a traceback for ours."""
 
 import errno
-import os
 import sys
 
 import click
@@ -85,24 +84,6 @@ def test_home_folders_in_arguments(monkeypatch: pytest.MonkeyPatch) -> None:
     wanted = ["--data=/home/me/a,/home/me/b,/c~", "/home/me"]
     wanted += ["--config.data.roots=('/home/me/a',)", "a~/b", "x=~me"]
     assert entry.expand_home(given) == wanted
-
-
-@pytest.mark.parametrize("variable", ["XDG_CACHE_HOME", "JAX_COMPILATION_CACHE_DIR"])
-def test_compiled_programs_are_cached_with_and_without_a_home_folder(
-    variable: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    updates: dict[str, object] = {}
-    monkeypatch.setattr(jax.config, "update", updates.__setitem__)
-    monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # no home folder
-    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
-    monkeypatch.setenv("XDG_CACHE_HOME", "")
-    entry.set_up_jax()
-    assert "jax_compilation_cache_dir" not in updates
-    monkeypatch.setenv(variable, "/cache")
-    entry.set_up_jax()
-    own = variable == "XDG_CACHE_HOME"
-    found = updates.get("jax_compilation_cache_dir")
-    assert found == ("/cache/radejax/jax" if own else None)
 
 
 def test_numbers_of_options_are_finite_and_in_their_range() -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from radejax.cli import main
+from radejax.cli.figures import MODEL
 from radejax.cli.train import train
 from radejax.core import memory
 from radejax.core.errors import UserError
@@ -102,7 +103,7 @@ def test_check_reports_as_text_and_as_json(root: pathlib.Path) -> None:
 def test_a_folder_without_frames_says_what_was_looked_for(
     root: pathlib.Path, tmp_path: pathlib.Path
 ) -> None:
-    result = _run("detect", root, "--workdir", tmp_path, "--out", tmp_path / "out")
+    result = _run("detect", root, "--workdir", MODEL, "--out", tmp_path / "out")
     assert result.exit_code == 2
     assert "tesseract_*.mat" in result.output
 

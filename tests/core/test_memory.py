@@ -3,7 +3,9 @@
 import os
 import pathlib
 import sys
+from types import SimpleNamespace
 
+import jax
 import pytest
 
 from radejax.core import memory
@@ -47,3 +49,26 @@ def test_a_program_is_restarted_once_and_with_its_own_words(
         monkeypatch.setattr(os, "environ", environment)
         memory.restart_with_huge_pages()
         assert len(calls) == 1
+
+
+@pytest.mark.parametrize(
+    ("home", "caches", "found"),
+    [
+        ("~", "", None),  # no home folder
+        ("~", "/caches", "/caches/radejax/jax"),
+        ("/home/me", "", "/home/me/.cache/radejax/jax"),
+    ],
+)
+def test_compiled_programs_are_stored_with_and_without_a_home_folder(
+    home: str, caches: str, found: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values: dict[str, object] = {"jax_compilation_cache_dir": None}
+    config = SimpleNamespace(values=values, update=values.__setitem__)
+    monkeypatch.setattr(jax, "config", config)
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path.replace("~", home))
+    monkeypatch.setenv("XDG_CACHE_HOME", caches)
+    memory.cache_compiled_programs()
+    assert values["jax_compilation_cache_dir"] == found
+    values["jax_compilation_cache_dir"] = "/mine"
+    memory.cache_compiled_programs()
+    assert values["jax_compilation_cache_dir"] == "/mine"

@@ -220,6 +220,20 @@ def test_arrays_of_other_kinds(detector, tesseracts):
             detector(wrong)
 
 
+def test_warming_up_compiles_for_the_inputs_of_the_sample(tesseracts):
+    detector = small.detector(batch_sizes=(2,))
+    sizes = [detector._run._cache_size()]
+    for call in (
+        lambda: detector.warmup(),
+        lambda: detector.warmup(2),
+        lambda: detector.warmup(tesseracts[:1]),
+        lambda: detector(tesseracts[:2]),
+    ):
+        call()
+        sizes.append(detector._run._cache_size())
+    assert sizes == [0, 1, 1, 2, 2]
+
+
 def test_arguments_by_name_and_wrong_ones():
     detector = small.detector(roi="narrow")
     assert tuple(detector.decode_options["roi"]) == tuple(NARROW_ROI)

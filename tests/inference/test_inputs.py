@@ -117,7 +117,7 @@ def test_a_stream_of_frames_with_images(fusion):
     for i, found in enumerate(fusion.stream(items)):
         expected = fusion(projection[i], image[i], calibration)
         _equal(found, expected)
-    fusion.warmup(1)
+    assert fusion.warmup(1) is fusion
     size = fusion._run._cache_size()
     fusion(*items[0])
     assert fusion._run._cache_size() == size

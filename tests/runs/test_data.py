@@ -1,6 +1,7 @@
 """Data folders of a run: found, checked, projected once."""
 
 import pathlib
+import re
 import shutil
 from types import SimpleNamespace
 from typing import Any
@@ -80,6 +81,7 @@ def test_frames_are_projected_beside_their_data_once(
     root: pathlib.Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     monkeypatch.chdir(root.parent)
     config = _config("sim")
@@ -99,7 +101,13 @@ def test_frames_are_projected_beside_their_data_once(
     assert not (root / "records").exists()
     config = _config("sim")
     config.train.batch_size = 4
-    data = _open(config)
+    with caplog.at_level("INFO", "radejax"):
+        data = _open(config)
+        assert re.search(r"input: 0\.54\d ± 0\.02\d in 4 frames to train", caplog.text)
+        assert "nearly constant" not in caplog.text
+        config.model.input_center = 0.4
+        _open(config)
+    assert "set --config.model.input_center=0.54" in caplog.text
     assert data.options.roots == (str(root),)
     assert data.options.records == str(root / "records")
     assert len(data.records.keys()) == 6
