@@ -118,6 +118,30 @@ def test_the_toy_data_set_gives_what_a_run_asks(tmp_path: pathlib.Path) -> None:
     np.testing.assert_array_equal(images.image(0), small.images(1)[0])
 
 
+def test_objects_that_cannot_be_learned_are_left_out_and_counted(
+    tmp_path: pathlib.Path,
+) -> None:
+    root = _write_toy(tmp_path)
+    path = root / "1" / "0001.npz"
+    good = [12.0, 1.0, 0.0, 4.2, 1.8, 1.6, 0.1]
+    boxes = np.array([good] * 5)
+    boxes[1, 2], boxes[2, 4], boxes[3, 0], boxes[4, 1] = np.nan, -1.0, -12.0, 99.0
+    content = dict(np.load(path)) | {"boxes": boxes, "classes": np.array(["Sedan"] * 5)}
+    np.savez(path, **content)
+    config = _config()
+    config.data.roots = (str(root),)
+    data = Data(config, models.build(config.model))
+    assert data.frames[0].boxes.tolist() == [good]
+    assert data.split("train")[0].classes.tolist() == ["Sedan"]
+    counts = data.frames.summary().counts
+    assert counts["objects left out: a value is not finite"] == 1
+    assert counts["objects left out: a size is not above 0"] == 1
+    assert counts["objects left out: field of view"] == 2
+    np.savez(path, **content | {"boxes": np.array([[*good[:6], 90.0]] * 5)})
+    with pytest.raises(UserError, match=r"frame 1/0001: yaw is 90, expected radians"):
+        Data(config, models.build(config.model))
+
+
 def test_the_protocol_counts_every_frame() -> None:
     truth, found, frames = random_scene(0)
     data = EvaluationSet(truth, found, frames=frames)

@@ -23,6 +23,8 @@ from radejax.data.tesseract import read_frame
 from radejax.geometry.camera import CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
 
+_MAX_YAW_RAD = 10.0  # larger angles are taken to be degrees
+
 
 @dataclasses.dataclass
 class Summary:
@@ -198,6 +200,41 @@ class LabelledFrames(Sequence[_F]):
         counts = other._summary.counts
         counts[f"frames left out: {reason}"] += len(self) - len(other)
         return other
+
+    def with_valid_boxes(self) -> Self:
+        """Returns the dataset without objects that no detector can learn.
+
+        These are boxes with values that are not finite or sizes that are not above 0, and
+        those whose center is outside the field of view. The summary counts them.
+
+        Raises:
+            UserError: Yaws are in degrees.
+        """
+        other = copy.copy(self)
+        other._summary = copy.deepcopy(self._summary)
+        other._frames = [self._valid(frame, other._summary.counts) for frame in self]
+        return other
+
+    def _valid(self, frame: _F, counts: collections.Counter[str]) -> _F:
+        boxes = np.asarray(frame.boxes, np.float64).reshape(-1, 7)
+        reasons = {
+            "a value is not finite": ~np.isfinite(boxes).all(axis=1),
+            "a size is not above 0": ~(boxes[:, 3:6] > 0).all(axis=1),
+            "field of view": ~self.grid.in_field_of_view(*boxes[:, :2].T),
+        }
+        kept = np.ones(len(boxes), bool)
+        for reason, is_wrong in reasons.items():
+            counts[f"objects left out: {reason}"] += int((kept & is_wrong).sum())
+            kept &= ~is_wrong
+        yaw = boxes[kept, 6]
+        if (np.abs(yaw) > _MAX_YAW_RAD).any():
+            raise UserError(
+                f"frame {frame.key}: yaw is {yaw[np.abs(yaw).argmax()]:g}, expected radians"
+            )
+        if kept.all():
+            return frame
+        classes = np.asarray(frame.classes)[kept]
+        return dataclasses.replace(frame, boxes=boxes[kept], classes=classes)
 
 
 def data_set(name: str) -> Callable[..., LabelledFrames]:

@@ -95,6 +95,8 @@ class Data:
             sequence_numbers=options.sequences or None,
             weather=options.weather or None,
         )
+        if options.format != "kradar":  # the reader of K-Radar checks its labels itself
+            self.frames = self.frames.with_valid_boxes()
 
     def preprocess(self) -> None:
         """Write the missing records on the main process while the others wait.
