@@ -59,8 +59,10 @@ def read_member(archive: zipfile.ZipFile, name: str, *, max_bytes: int) -> bytes
         return archive.read(info)
 
 
-def read_npy(path: PathLike) -> np.ndarray:
+def read_npy(path: PathLike, *, mapped: bool = False) -> np.ndarray:
     """Reads the array of a `.npy` file, which must not contain pickled objects.
+
+    If `mapped`, only header and size of the file are read, and the array is a memory map.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -71,7 +73,7 @@ def read_npy(path: PathLike) -> np.ndarray:
         size, expected = as_path(path).stat().st_size, array.offset + array.nbytes
         if size != expected:
             raise DataError(f"{path}: corrupted, {size} bytes, expected {expected}")
-        return np.array(array)
+        return array if mapped else np.array(array)
 
 
 def read_npz(path: PathLike) -> dict[str, np.ndarray]:

@@ -41,6 +41,8 @@ from radejax.geometry.radar_grid import RadarGrid
 
 VARIABLE = "arrDREA"
 
+_MAX_ZERO_SHARE = 0.05
+
 
 def read_tesseract(
     path: PathLike, *, shape_drea: tuple[int, ...] | None = None
@@ -104,10 +106,11 @@ def check_tesseract(
 def read_projection_npy(
     path: PathLike, *, projection_shape: tuple[int, ...] | None = None
 ) -> Float[np.ndarray, "R A DE"]:
-    """Read a projection of the released code and move its channels last.
+    """Read a projection in the order of the released code, or with its channels last.
 
     Args:
-        path: `DERA_tesseract_*.npy`, `[D+E, R, A]` floats.
+        path: `DERA_tesseract_*.npy`, `[D+E, R, A]` floats. `[R, A, D+E]` is read too if
+            `projection_shape` tells that it is meant.
         projection_shape: Expected shape `(R, A, D+E)`, or None to accept any.
 
     Returns:
@@ -119,25 +122,41 @@ def read_projection_npy(
             that are not finite or beyond `MAX_LEVEL`.
     """
     stored = read_npy(path)
-    if stored.ndim != 3 or stored.dtype.kind != "f":
-        raise DataError(
-            f"{path}: expected floats [Doppler + elevation, range, azimuth], got "
-            f"{stored.shape} of {stored.dtype}"
-        )
+    axes = _projection_axes(path, stored, projection_shape)
     is_possible = np.abs(stored) <= MAX_LEVEL  # False for NaN
     if not is_possible.all():
         raise DataError(
             f"{path}: corrupted, {int((~is_possible).sum())} of {stored.size} values are "
             f"not finite or beyond {MAX_LEVEL:g}, which no power gives"
         )
-    projection = np.ascontiguousarray(stored.transpose(1, 2, 0))
-    if projection_shape is not None and projection.shape != tuple(projection_shape):
+    if (share := np.mean(stored == 0)) > _MAX_ZERO_SHARE:
+        raise DataError(f"{path}: corrupted, {share:.0%} of the values are exactly 0")
+    return np.ascontiguousarray(stored.transpose(axes))
+
+
+def check_projection_npy(path: PathLike, projection_shape: tuple[int, ...]) -> None:
+    """Raise the errors of `read_projection_npy` that header and size of a file show."""
+    _projection_axes(path, read_npy(path, mapped=True), projection_shape)
+
+
+def _projection_axes(
+    path: PathLike, stored: np.ndarray, projection_shape: tuple[int, ...] | None
+) -> tuple[int, int, int]:
+    """Return the positions of range, azimuth and channels in a stored projection."""
+    if stored.ndim == 3 and stored.dtype.kind == "f":
+        if projection_shape in (None, stored.transpose(1, 2, 0).shape):
+            return 1, 2, 0
+        if projection_shape == stored.shape:
+            return 0, 1, 2
+    expected = "[Doppler + elevation, range, azimuth]"
+    if projection_shape is not None:
         r, a, c = projection_shape
-        raise DataError(
-            f"{path}: shape {stored.shape}, expected {(c, r, a)} "
-            "(Doppler + elevation, range, azimuth)"
-        )
-    return projection
+        expected += f" = {(c, r, a)}, or {projection_shape} with the channels last"
+    hint = "; it seems to be a radar tensor" if stored.ndim == 4 else ""
+    raise DataError(
+        f"{path}: shape {stored.shape} of {stored.dtype}, expected floats "
+        f"{expected}{hint}"
+    )
 
 
 def read_frame(path: PathLike, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:

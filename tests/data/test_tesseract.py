@@ -12,6 +12,7 @@ from radejax.data.projection import project_tensor
 from radejax.data.tesseract import (
     Layout,
     _read_columns,
+    check_projection_npy,
     check_tesseract,
     project_file,
     read_projection_npy,
@@ -210,8 +211,17 @@ def test_released_projections(tmp_path, tesseract, dtype):
     found = read_projection_npy(path, projection_shape=(6, 5, 7))
     np.testing.assert_array_equal(found, wanted)
     assert found.dtype == dtype
-    with pytest.raises(DataError, match=r"shape \(7, 6, 5\), expected \(8, 6, 5\)"):
+    message = r"shape \(7, 6, 5\) of float\d\d, expected floats .* = \(8, 6, 5\), or \(6, 5, 8\)"
+    with pytest.raises(DataError, match=message):
         read_projection_npy(path, projection_shape=(6, 5, 8))
+    np.save(path, wanted)  # channels last
+    found = read_projection_npy(path, projection_shape=(6, 5, 7))
+    np.testing.assert_array_equal(found, wanted)
+    check_projection_npy(path, (6, 5, 7))
+    np.save(path, tesseract)
+    for read in (check_projection_npy, lambda *x: read_projection_npy(x[0])):
+        with pytest.raises(DataError, match="it seems to be a radar tensor"):
+            read(path, (6, 5, 7))
 
 
 def test_bad_released_projections(tmp_path):
@@ -220,6 +230,9 @@ def test_bad_released_projections(tmp_path):
         np.save(path, np.where(np.arange(210).reshape(7, 6, 5) == 9, value, 0.5))
         with pytest.raises(DataError, match="1 of 210 values are not finite or beyond"):
             read_projection_npy(path)
+    np.save(path, np.where(np.arange(210).reshape(7, 6, 5) < 21, 0.0, 0.5))
+    with pytest.raises(DataError, match="10% of the values are exactly 0"):
+        read_projection_npy(path)
     path.unlink()
     with pytest.raises(FileNotFoundError, match=r"p\.npy"):
         read_projection_npy(path)

@@ -19,7 +19,11 @@ from radejax.core.structures import CLASSES, RARE_SHARE
 from radejax.data.dataset import Summary
 from radejax.data.kradar.conditions import KRADAR_CONDITIONS, UNKNOWN_CONDITIONS
 from radejax.data.kradar.dataset import Frame, KRadar, SequenceFolder, read_calibration
-from radejax.data.tesseract import check_tesseract
+from radejax.data.tesseract import (
+    check_projection_npy,
+    check_tesseract,
+    read_projection_npy,
+)
 from radejax.geometry.radar_grid import RadarGrid
 
 Rows = list[dict[str, Any]]
@@ -134,15 +138,24 @@ def check_dataset(
             raise UserError("no frames of these sequences and weathers")
         folders = {number: folders[number] for number in frames}
     tensors = [
-        (number, path) for number in folders for path in _tensors(folders[number])
+        (number, path)
+        for number, folder in folders.items()
+        for path in [*_tensors(folder), *_projections(folder)]
     ]
     corrupted: collections.Counter[int] = collections.Counter()
+    grid = data.grid
     for number, path in tqdm(tensors, "check", unit="file", disable=not progress):
         try:
-            check_tesseract(path, shape_drea=data.grid.shape_drea, deep=deep)
+            if path.suffix == ".mat":
+                check_tesseract(path, shape_drea=grid.shape_drea, deep=deep)
+            elif deep:
+                read_projection_npy(path, projection_shape=grid.projection_shape)
+            else:
+                check_projection_npy(path, grid.projection_shape)
         except DataError as error:
-            summary.problems.append(("tesseract corrupted", str(error)))
-            corrupted[number] += 1
+            kind = "tesseract" if path.suffix == ".mat" else "projection"
+            summary.problems.append((f"{kind} corrupted", str(error)))
+            corrupted[number] += kind == "tesseract"
         except OSError as error:
             summary.problems.append(("tesseract not readable", str(error)))
     is_kradar = data.grid.shape_drea == RadarGrid.kradar().shape_drea
@@ -165,6 +178,11 @@ def _tensors(folder: SequenceFolder) -> list[pathlib.Path]:
     return [path for path in files if path.suffix == ".mat"]
 
 
+def _projections(folder: SequenceFolder) -> list[pathlib.Path]:
+    files = folder.listing("DERA_tesseract").values()
+    return [path for path in files if path.suffix == ".npy"]
+
+
 def _row(
     number: int,
     folder: SequenceFolder,
@@ -184,7 +202,7 @@ def _row(
         "labels": len(frames),
         "train": in_split["train"],
         "test": in_split["test"],
-        "projections": len(folder.listing("DERA_tesseract")),
+        "projections": len(_projections(folder)),
         "images": len(folder.listing("cam-front")),
         "images_missing": sum(frame.camera_path is None for frame in frames),
         "calibration": calibration,

@@ -78,6 +78,21 @@ def test_deep_reads_what_the_head_does_not_say(root):
     assert report.summary.problem_counts() == {"tesseract corrupted": 1}
 
 
+def test_projections_are_checked_too(root):
+    grid = KRadar(root).grid
+    path = root / "1/DERA_tesseract/DERA_tesseract_00005.npy"
+    path.parent.mkdir()
+    np.save(path, np.full(grid.projection_shape, 0.5))
+    assert check_dataset(root).num_problems == 0
+    np.save(path, np.full(grid.shape_drea, 1e6))
+    (message,) = check_dataset(root).to_dict()["summary"]["problems"]
+    assert "00005.npy: shape (6, 16, 5, 12) of float64" in message
+    np.save(path, np.full(grid.projection_shape, np.nan))
+    assert check_dataset(root).num_problems == 0
+    report = check_dataset(root, deep=True)
+    assert report.summary.problem_counts() == {"projection corrupted": 1}
+
+
 def test_a_file_that_cannot_be_read_is_not_corrupted(root, monkeypatch):
     def fail(path, **_):
         raise OSError(errno.EIO, "Input/output error", str(path))
