@@ -37,9 +37,10 @@ from radejax.cli import entry
 @click.option(
     "--format",
     "file_format",
-    type=click.Choice(["json", "kitti"]),
+    type=click.Choice(["json", "kitti", "csv", "parquet"]),
     default="json",
-    help="kitti: preds/000000.txt as K-Radar's tools write them.",
+    help="json: one file per frame. kitti: preds/000000.txt as K-Radar's tools write them. "
+    "csv, parquet: a single table (parquet needs pandas and pyarrow).",
 )
 @entry.batch_size(8, "Frames per call of the detector.")
 @entry.image_backbone
@@ -51,7 +52,7 @@ def detect(
     as_json: bool,
     **settings: Any,
 ) -> None:
-    """Find boxes in every frame below the folders; one file per frame.
+    """Find boxes in every frame below the folders.
 
     The model is a run, its checkpoints, one of them, an exported folder or an official
     .pth file. A folder is a K-Radar root, a folder with tesseract_*.mat or projection

@@ -6,11 +6,15 @@ which image belongs to each frame.
 
 from __future__ import annotations
 
+import csv
 import dataclasses
+import importlib.util
+import io
+import itertools
 import json
 import os
 import pathlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,7 +22,7 @@ import tqdm
 
 from radejax.core import files
 from radejax.core.errors import UserError
-from radejax.core.structures import Detections, frame_key
+from radejax.core.structures import BOX_FIELDS, Detections, frame_key
 from radejax.data.dataset import data_set
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.conditions import check_weather, read_description
@@ -161,6 +165,8 @@ def detect_files(
         batch_size: Number of frames per call of the detector.
         file_format: "json", or "kitti" for files `preds/000000.txt` in the format of
             K-Radar's tools, and `frames.json` with the frames that these numbers stand for.
+            "csv" and "parquet" write one table `boxes.csv` or `boxes.parquet` of all boxes
+            at the end, in the columns of the records.
         sequence_numbers: Numbers of the sequences to take, see `find_frames`.
         weather: Kinds of weather to take, see `find_frames`.
         labels: Label revision in which a radar-camera model's images are looked up; the
@@ -178,6 +184,11 @@ def detect_files(
         UserError: There is no frame, two frames would be written to the same file, or an
             image or weight is not as expected.
     """
+    needed = ("pandas", "pyarrow") if file_format == "parquet" else ()
+    if lacking := [name for name in needed if importlib.util.find_spec(name) is None]:
+        raise UserError(
+            f"format parquet needs {' and '.join(lacking)}: pip install them"
+        )
     detector = Detector.from_workdir(source, step, image_backbone=image_backbone)
     is_kradar = detector.saved.config.data.format == "kradar"
     read, part = _files if is_kradar else _frames, (sequence_numbers, weather)
@@ -190,16 +201,22 @@ def detect_files(
         table = {"frame": list(range(len(keys))), "name": keys}
         files.write_json(out / "frames.json", table)
     batches = _batches(keys, batch_size)
+    is_table, rows = file_format in ("csv", "parquet"), list[dict[str, Any]]()
     found = detector.stream(inputs, **settings)
     count = {"frames": len(keys), "boxes": 0, "clipped": 0}
     with tqdm.tqdm(total=len(keys), desc="detect", unit="frame") as bar:
         for batch, detections in zip(batches, found, strict=True):
-            texts = _texts(keys[batch], detections, file_format)
-            for name, text in zip(names[batch], texts, strict=True):
-                files.write_text(out / name, text)
+            if is_table:
+                rows += itertools.chain(*_records(keys[batch], detections))
+            else:
+                texts = _texts(keys[batch], detections, file_format)
+                for name, text in zip(names[batch], texts, strict=True):
+                    files.write_text(out / name, text)
             count["boxes"] += int(np.asarray(detections.is_valid).sum())
             count["clipped"] += int(detections.num_clipped.sum())
-            bar.update(len(texts))
+            bar.update(len(keys[batch]))
+    if is_table:
+        _write_table(out / f"boxes.{file_format}", rows)
     if detector.takes_camera:
         count["radar_only"] = detector.num_radar_only
     return count
@@ -278,9 +295,30 @@ def _texts(keys: Sequence[str], detections: Detections, file_format: str) -> lis
     """Return the contents of the files of a batch of frames."""
     if file_format == "kitti":
         return [f"{text}\n" for text in kitti.prediction_texts(detections)]
-    frames = zip(keys, detections.to_list(), strict=True)
-    named = [[{"frame": key, **box} for box in boxes] for key, boxes in frames]
+    named = _records(keys, detections)
     return [json.dumps(boxes, indent=2) + "\n" for boxes in named]
+
+
+def _records(keys: Sequence[str], detections: Detections) -> list[list[dict[str, Any]]]:
+    """Return the boxes of every frame of a batch, with the key of the frame."""
+    frames = zip(keys, detections.to_list(), strict=True)
+    return [[{"frame": key, **box} for box in boxes] for key, boxes in frames]
+
+
+def _write_table(path: pathlib.Path, rows: Sequence[Mapping[str, Any]]) -> None:
+    """Write boxes as CSV or Parquet, atomically."""
+    columns = ("frame", "cls", "score", *BOX_FIELDS)
+    if path.suffix == ".csv":
+        text = io.StringIO()
+        table = csv.DictWriter(text, columns, lineterminator="\n")
+        table.writeheader()
+        table.writerows(rows)
+        files.write_text(path, text.getvalue())
+        return
+    import pandas as pd  # an optional dependency
+
+    with files.atomic_path(path) as temporary:
+        pd.DataFrame(rows, columns=list(columns)).to_parquet(temporary)
 
 
 def key_of(path: pathlib.Path) -> str:

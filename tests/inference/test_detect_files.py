@@ -1,5 +1,7 @@
 """Frames in folders, their images, models of every kind, names of results."""
 
+import csv
+import importlib.util
 import json
 from types import SimpleNamespace
 
@@ -93,6 +95,16 @@ def test_boxes_of_an_exported_folder(tmp_path):
         assert all(b["frame"] == f"7/{i:05}" for b in found)
     model, data, text = tmp_path / "packed", [tmp_path / "data"], tmp_path / "k"
     detect_files(model, data, text, batch_size=2, file_format="kitti")
+    detect_files(model, data, tmp_path / "t", batch_size=2, file_format="csv")
+    with open(tmp_path / "t" / "boxes.csv", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["frame"] for row in rows] == [
+        f"7/{i:05}" for i, boxes in enumerate(expected) for _ in boxes
+    ]
+    assert float(rows[0]["yaw"]) == pytest.approx(expected[0][0]["yaw"], abs=1e-5)
+    if not importlib.util.find_spec("pyarrow"):
+        with pytest.raises(UserError, match=r"parquet needs .*pyarrow: pip install"):
+            detect_files(model, data, tmp_path / "t", file_format="parquet")
     # Either is scored against labels whose frames have the key of both sensors.
     table = {
         "frame": [4, 5],
