@@ -243,7 +243,8 @@ class Label(NamedTuple):
 def draw_labels(ax: Axes, labels: Sequence[Label], font_size: float = 7.5) -> None:
     """Write each text next to its outline, unless it would cover an earlier text.
 
-    Labels whose outline has its center outside the axes are left out too. The limits and
+    Labels whose outline has its center outside the axes are left out too, and others are
+    moved into the axes. The limits and
     the aspect of the axes must be final, because overlaps are computed in pixels.
 
     Args:
@@ -264,13 +265,15 @@ def draw_labels(ax: Axes, labels: Sequence[Label], font_size: float = 7.5) -> No
         size *= font_size * point
         offset = (last - first) / 2 + gap
         middle = center + (right, up) * (offset + size / 2)
+        shift = np.clip(middle, low + size / 2, high - size / 2) - middle
+        middle = middle + shift
         box = np.concatenate([middle - size / 2, middle + size / 2])
         is_outside = (center < low).any() or (center > high).any()
         is_covered = (taken[:, :2] < box[2:]).all(1) & (taken[:, 2:] > box[:2]).all(1)
         if is_outside or is_covered.any():
             continue
         taken = np.concatenate([taken, box[None]])
-        x, y = ax.transData.inverted().transform(center + (right, up) * offset)
+        x, y = ax.transData.inverted().transform(center + (right, up) * offset + shift)
         ax.text(
             *(x, y, label.text),
             ha=align,
