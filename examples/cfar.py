@@ -21,6 +21,7 @@ import numpy as np
 from scipy import ndimage
 
 from radejax.core.structures import CLASSES
+from radejax.data.points import local_mean_db
 from radejax.data.projection import LOG_OFFSET_DB, LOG_SCALE_DB
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.radar.tensor import RadarParameters
@@ -160,7 +161,8 @@ def detect(
     """
     settings = settings or CfarSettings()
     power_db = _power_db(projection, grid)
-    excess_db = power_db - local_mean_db(power_db, settings)
+    cells = settings.guard_cells, settings.training_cells
+    excess_db = power_db - local_mean_db(power_db, *cells)
     peaks = find_peaks(power_db, excess_db, grid, settings)
     boxes, names, scores = [], [], []
     for r, a in peaks:
@@ -178,20 +180,6 @@ def detect(
         "cls": np.array(names, dtype=np.str_)[order],
         "score": np.array(scores, float)[order],
     }
-
-
-def local_mean_db(power_db: np.ndarray, settings: CfarSettings) -> np.ndarray:
-    """Returns the mean linear power `[R, A]` of the training cells around each bin in dB.
-
-    The map is padded with its edge values.
-    """
-    power = 10.0 ** (power_db / 10.0)
-    inner = 2 * settings.guard_cells + 1
-    outer = inner + 2 * settings.training_cells
-    whole = ndimage.uniform_filter(power, outer, mode="nearest") * outer**2
-    guard = ndimage.uniform_filter(power, inner, mode="nearest") * inner**2
-    mean = (whole - guard) / (outer**2 - inner**2)
-    return 10.0 * np.log10(np.maximum(mean, 1e-10))
 
 
 def find_peaks(

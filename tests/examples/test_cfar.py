@@ -33,15 +33,6 @@ def projection_of(*targets):
     )
 
 
-def test_local_mean_by_hand():
-    settings = cfar.CfarSettings(guard_cells=1, training_cells=1)
-    power = np.full((7, 7), 1.0)
-    power[3, 3] = 1000.0  # in the guard: does not count
-    power[1, 3] = 17.0  # one of 16 training cells: mean (15 + 17) / 16 = 2
-    mean = cfar.local_mean_db(10 * np.log10(power), settings)
-    assert mean[3, 3] == pytest.approx(10 * np.log10(2.0))
-
-
 def test_finds_cars_where_they_are():
     projection = projection_of((20.0, -0.2, 8.0), (40.0, 0.3, 8.0))
     found = cfar.detect(projection, GRID, PARAMETERS)

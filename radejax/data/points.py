@@ -1,0 +1,85 @@
+"""Point clouds from projections by cell-averaging CFAR."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.ndimage import uniform_filter
+
+from radejax.data.projection import LOG_OFFSET_DB, LOG_SCALE_DB
+from radejax.geometry.radar_grid import RadarGrid
+
+
+class Points(NamedTuple):
+    """Radar points as columns of equal length, by descending power.
+
+    Attributes:
+        x_m, y_m, z_m: Position in the radar frame: forward, left and up from the radar.
+        doppler_mps: Doppler velocity of the strongest Doppler bin.
+        power_db: Power of the strongest Doppler bin.
+    """
+
+    x_m: Float[np.ndarray, " N"]
+    y_m: Float[np.ndarray, " N"]
+    z_m: Float[np.ndarray, " N"]
+    doppler_mps: Float[np.ndarray, " N"]
+    power_db: Float[np.ndarray, " N"]
+
+
+def cfar_points(
+    projection: Float[np.ndarray, "R A DE"],
+    grid: RadarGrid,
+    *,
+    threshold_db: float = 9.0,
+    guard_cells: int = 4,
+    training_cells: int = 6,
+) -> Points:
+    """Detects points in the range-azimuth map of a projection.
+
+    The elevation and the Doppler velocity of a point are those of the strongest bins of the
+    two halves of the projection.
+
+    Args:
+        projection: Normalized projection, as `project_tensor` returns it.
+        grid: Sensor axes of the projection.
+        threshold_db: Minimum power of a point above the mean of its training cells.
+        guard_cells: Number of guard cells on each side of a bin.
+        training_cells: Number of training cells on each side, outside the guard cells.
+
+    References:
+        Cell averaging: Richards, Fundamentals of Radar Signal Processing, ch. 6.
+    """
+    doppler, elevation = np.split(projection, [grid.num_doppler], axis=-1)
+    power_db = doppler.max(-1) * LOG_SCALE_DB - LOG_OFFSET_DB
+    mean_db = local_mean_db(power_db, guard_cells, training_cells)
+    r, a = np.nonzero(power_db - mean_db > threshold_db)
+    order = np.argsort(-power_db[r, a], kind="stable")
+    r, a = r[order], a[order]
+    azimuth_rad = grid.azimuth_rad[a]
+    elevation_rad = grid.elevation_rad[elevation[r, a].argmax(-1)]
+    ground_m = grid.range_m[r] * np.cos(elevation_rad)
+    return Points(
+        x_m=ground_m * np.cos(azimuth_rad),
+        y_m=-ground_m * np.sin(azimuth_rad),
+        z_m=grid.range_m[r] * np.sin(elevation_rad),
+        doppler_mps=grid.doppler_mps[doppler[r, a].argmax(-1)],
+        power_db=power_db[r, a],
+    )
+
+
+def local_mean_db(
+    power_db: Float[np.ndarray, "R A"], guard_cells: int, training_cells: int
+) -> Float[np.ndarray, "R A"]:
+    """Returns the mean linear power of the training cells around each bin in dB.
+
+    The map is padded with its edge values.
+    """
+    power = 10.0 ** (power_db.astype(np.float64) / 10.0)
+    inner = 2 * guard_cells + 1
+    outer = inner + 2 * training_cells
+    whole = uniform_filter(power, outer, mode="nearest") * outer**2
+    guard = uniform_filter(power, inner, mode="nearest") * inner**2
+    mean = (whole - guard) / (outer**2 - inner**2)
+    return 10.0 * np.log10(np.maximum(mean, 1e-10))

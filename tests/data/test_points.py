@@ -1,0 +1,40 @@
+"""CFAR points of maps with known results."""
+
+import numpy as np
+import pytest
+
+from radejax.data.points import cfar_points, local_mean_db
+from radejax.data.projection import project_tensor
+from radejax.geometry.radar_grid import RadarGrid
+
+GRID = RadarGrid.reduced(
+    num_doppler=8, num_range=64, num_elevation=5, num_azimuth=56, max_range_m=75.6
+)
+
+
+def test_local_mean_by_hand():
+    power = np.full((7, 7), 1.0)
+    power[3, 3] = 1000.0  # in the guard: does not count
+    power[1, 3] = 17.0  # one of 16 training cells: mean (15 + 17) / 16 = 2
+    mean = local_mean_db(10 * np.log10(power), 1, 1)
+    assert mean[3, 3] == pytest.approx(10 * np.log10(2.0))
+
+
+def test_points_are_where_the_echoes_are():
+    power = np.full(GRID.shape_drea, 1e9, np.float32)
+    power[6, 30, 4, 40] = 1e13
+    power[1, 50, 0, 10] = 1e12
+    points = cfar_points(project_tensor(power), GRID)
+    assert points.power_db == pytest.approx([130.0, 120.0], abs=1e-3)
+    assert points.doppler_mps.tolist() == GRID.doppler_mps[[6, 1]].tolist()
+    position = np.stack(points[:3], -1)
+    np.testing.assert_allclose(np.linalg.norm(position, axis=1), GRID.range_m[[30, 50]])
+    azimuth_rad = -np.arctan2(points.y_m, points.x_m)
+    np.testing.assert_allclose(azimuth_rad, GRID.azimuth_rad[[40, 10]])
+    elevation_rad = np.arcsin(points.z_m / GRID.range_m[[30, 50]])
+    np.testing.assert_allclose(elevation_rad, GRID.elevation_rad[[4, 0]])
+
+
+def test_a_constant_map_has_no_points():
+    points = cfar_points(np.full(GRID.projection_shape, 0.5, np.float32), GRID)
+    assert [column.shape for column in points] == [(0,)] * 5

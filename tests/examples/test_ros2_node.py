@@ -1,0 +1,32 @@
+"""Conversions of the ROS 2 node, without ROS."""
+
+import numpy as np
+import pytest
+import ros2_node
+
+from radejax.data.points import Points
+
+from .. import small_models as small
+
+
+def test_boxes_have_the_yaw_as_a_quaternion():
+    detector, projection = small.detector(), small.projections(1)
+    detections = detector(projection)
+    rows = list(ros2_node.box_fields(detections))
+    assert len(rows) == int(detections.is_valid.sum()) > 0
+    for row, (position, quaternion, size, cls, score) in enumerate(rows):
+        box = np.asarray(detections.boxes[0, row])
+        np.testing.assert_allclose([*position, *size], box[:6])
+        x, y, z, w = quaternion
+        assert (x, y) == (0.0, 0.0)
+        assert z * z + w * w == pytest.approx(1.0)
+        assert np.sin(2 * np.arctan2(z, w) - box[6]) == pytest.approx(0.0, abs=1e-6)
+        assert cls == detector.classes[int(detections.classes[0, row])]
+        assert score == pytest.approx(float(detections.scores[0, row]))
+
+
+def test_points_are_float32_one_after_the_other():
+    columns = np.arange(10.0).reshape(5, 2)
+    names, data = ros2_node.point_bytes(Points(*columns))
+    assert len(data) == 2 * 4 * len(names)
+    np.testing.assert_array_equal(np.frombuffer(data, "<f4").reshape(2, 5), columns.T)
