@@ -15,10 +15,7 @@ from radejax.data.projection import project_tensor
 
 
 def box_fields(detections):
-    """Yields position, quaternion (x, y, z, w), size, class and score of the first frame's boxes.
-
-    The axes are those of REP 103: x forward, y left and z up. z is measured from the LiDAR.
-    """
+    """Yields position (z from the LiDAR), quaternion, size, class and score of every box."""
     for box in detections.to_list()[0]:
         half_yaw = box["yaw"] / 2
         quaternion = (0.0, 0.0, float(np.sin(half_yaw)), float(np.cos(half_yaw)))
@@ -51,8 +48,8 @@ def main(workdir, frame_id):
     def publish(message):
         tensor = np.array(message.data, np.float32).reshape(detector.grid.shape_drea)
         projection, result = project_tensor(tensor), Detection3DArray()
-        result.header.frame_id = frame_id
-        result.header.stamp = node.get_clock().now().to_msg()
+        result.header.frame_id, now = frame_id, node.get_clock().now()
+        result.header.stamp = now.to_msg()
         for position, quaternion, size, cls, score in box_fields(detector(projection)):
             found, kind = Detection3D(header=result.header), ObjectHypothesisWithPose()
             center, shape, q = (

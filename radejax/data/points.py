@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import uniform_filter  # type: ignore[attr-defined]
 
 from radejax.data.projection import LOG_OFFSET_DB, LOG_SCALE_DB
 from radejax.geometry.radar_grid import RadarGrid
