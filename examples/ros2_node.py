@@ -2,8 +2,7 @@
 
     python examples/ros2_node.py runs/quickstart --frame-id radar
 
-It needs ROS 2 with `vision_msgs` in the Python environment of radejax. docs/ros2.md describes the
-topics.
+It needs ROS 2 with `vision_msgs` in radejax's environment; docs/ros2.md describes the topics.
 """
 
 import click

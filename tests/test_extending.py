@@ -20,6 +20,7 @@ from radejax.data.cameras import CameraOptions
 from radejax.data.dataset import data_set
 from radejax.data.kradar import KRadar
 from radejax.data.pipeline import camera_inputs
+from radejax.data.records import preprocess
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOLS
 from radejax.inference.detect_files import detect_files
@@ -116,6 +117,32 @@ def test_the_toy_data_set_gives_what_a_run_asks(tmp_path: pathlib.Path) -> None:
     images = camera_inputs(train, small.IMAGE_SIZE, CameraOptions())
     assert [bool(camera.is_valid) for camera in images.cameras] == [True, False]
     np.testing.assert_array_equal(images.image(0), small.images(1)[0])
+
+
+def test_records_of_other_files_or_of_another_reader_are_reported(
+    tmp_path: pathlib.Path,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    root, reader = _write_toy(tmp_path), data_set("toy:Toy")
+
+    def again() -> str:
+        caplog.clear()
+        with caplog.at_level("INFO", "radejax"):
+            preprocess(reader([root], classes=("Sedan",)), tmp_path / "records")
+        return caplog.text
+
+    again()
+    text = again()
+    assert f"4 records in {tmp_path / 'records'} are used" in text
+    assert "changed" not in text
+    (root / "1" / "0002.npz").touch()
+    assert "radar files of 1 of them, such as that of frame 1/0002, have" in again()
+    monkeypatch.setattr(reader, "reader_version", "2")
+    with pytest.raises(
+        UserError, match=r"other records: source.reader is \['toy:Toy', ''"
+    ):
+        again()
 
 
 def test_objects_that_cannot_be_learned_are_left_out_and_counted(

@@ -156,7 +156,12 @@ class LabelledFrames(Sequence[_F]):
     Attributes:
         grid: Sensor axes of the radar.
         is_simulated: Whether the dataset is simulated.
+        reader_version: Text that a reader changes when it computes other projections from
+            the same files; records of another version are not used. None if neither the
+            reader nor the files change, which are then not compared with their records.
     """
+
+    reader_version: str | None = ""
 
     def __init__(
         self,

@@ -14,6 +14,7 @@ import dataclasses
 import functools
 import itertools
 import json
+import logging
 import math
 import os
 import pathlib
@@ -32,6 +33,8 @@ from radejax.core.workers import process_pool
 from radejax.data.dataset import FrameSequence, LabelledFrame, LabelledFrames
 from radejax.data.projection import ENCODINGS, encode
 from radejax.geometry.radar_grid import RadarGrid
+
+_log = logging.getLogger(__name__)
 
 _DESCRIPTION = "records.json"
 _MAX_LISTED = 20
@@ -308,9 +311,14 @@ def preprocess(
         exists = (folder / _DESCRIPTION).is_file()
         dtype = Records.open(folder).dtype if exists else "float16"
     grid = frames.grid
-    source = {"grid": grid.to_dict()}
+    source: dict[str, Any] = {"grid": grid.to_dict()}
+    if frames.reader_version is not None:
+        name = f"{type(frames).__module__}:{type(frames).__qualname__}"
+        source["reader"] = [name, frames.reader_version]
     records = Records.create(folder, grid.projection_shape, dtype, source)
     keys, mine = records.keys(), list(frames)[index::count]
+    if frames.reader_version is not None:
+        _warn_of_changes(records, [frame for frame in mine if frame.key in keys])
     missing = [frame for frame in mine if frame.key not in keys]
     if num_workers is None:
         is_small = len(missing) * math.prod(grid.shape_drea) < _SMALL_JOB_BINS
@@ -326,6 +334,31 @@ def preprocess(
         skipped = dict(sorted((key, reason) for key, reason in bar if reason))
     num_found = len(mine) - len(missing)
     return PreprocessReport(len(mine), num_found, skipped, time.perf_counter() - began)
+
+
+def _file_of(frame: LabelledFrame) -> list[Any] | None:
+    """Returns name, size and modification time of the radar file of a frame, if it exists."""
+    if frame.radar_path is None or not frame.radar_path.exists():
+        return None
+    found = frame.radar_path.stat()
+    return [frame.radar_path.name, found.st_size, found.st_mtime_ns]
+
+
+def _warn_of_changes(records: Records, frames: FrameSequence) -> None:
+    """Logs which records are used and which of their radar files have changed since."""
+    found = (
+        (f.key, _file_of(f), records.path(f.key).with_suffix(".json")) for f in frames
+    )
+    changed = [
+        key for key, file, path in found if file and files.read_json(path) != file
+    ]
+    _log.info("%d records in %s are used", len(frames), records.folder)
+    if changed:
+        _log.warning(
+            "the radar files of %d of them, such as that of frame %s, have changed: delete "
+            "the folder to preprocess them again",
+            *(len(changed), changed[0]),
+        )
 
 
 def _write_all(
@@ -353,5 +386,7 @@ def _write(records: Records, frame: LabelledFrame) -> tuple[str, str]:
         projection = frame.read_projection(records.grid)
     except (DataError, OSError) as error:
         return frame.key, str(error)
+    if "reader" in records.source:
+        files.write_json(records.path(frame.key).with_suffix(".json"), _file_of(frame))
     records.write(frame.key, encode(projection, records.dtype))
     return frame.key, ""

@@ -166,8 +166,7 @@ def test_another_run_writes_what_is_missing(data, folder, copy):
     for frame in (data[1], data[7]):
         records.path(frame.key).unlink()
     before = {path: path.stat().st_mtime_ns for path in copy.rglob("*.npy")}
-    part = LabelledFrames(data[2:9], data.grid)
-    report = run(part, copy)
+    report = run(data.without({f.key for f in data[:2] + data[9:]}, "test"), copy)
     assert (report.num_frames, report.num_found, report.num_written) == (7, 6, 1)
     assert run(data, copy).num_written == 1
     assert contents(copy) == contents(folder)

@@ -140,6 +140,8 @@ class KRadar(LabelledFrames[Frame]):
         >>> print(data.summary().to_text())  # doctest: +SKIP
     """
 
+    reader_version = None
+
     def __init__(
         self,
         root: PathLike | Iterable[PathLike] | None = None,
