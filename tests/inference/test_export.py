@@ -248,12 +248,39 @@ def test_onnx_files_give_the_same_boxes(kind, tmp_path):
         np.testing.assert_allclose(values, getattr(maps, name), atol=1e-4)
 
 
-def test_the_documented_decoder_finds_the_boxes_before_nms(tmp_path, monkeypatch):
+def _documented(part):
+    """Return the code block of docs/deploy.md that contains a text."""
     page = pathlib.Path(__file__).parents[2] / "docs" / "deploy.md"
-    blocks = page.read_text(encoding="utf-8").split("```python\n")
-    (code,) = (
-        block.split("```")[0] for block in blocks if "sliding_window_view" in block
+    blocks = page.read_text(encoding="utf-8").split("```python\n")[1:]
+    (code,) = (code for block in blocks if part in (code := block.split("```")[0]))
+    return code
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["stablehlo", "onnx"])
+def test_the_documented_code_runs_an_exported_folder(kind, tmp_path, monkeypatch):
+    detector, projection = small.detector(), small.projections(1)
+    expected = detector(
+        projection, score_threshold=0.3, nms_iou=0.3, roi=(-1e9, 1e9) * 3
     )
+    monkeypatch.chdir(tmp_path)
+    found = {"projection": projection}
+    if kind == "onnx":
+        for name in ("jax2onnx", "onnxruntime"):
+            pytest.importorskip(name)
+        export.export(detector, "onnx", kind=kind)
+        exec(_documented('InferenceSession("onnx/detector.onnx")'), found)
+        boxes = found["boxes"]
+    else:
+        export.export(detector, "exported")
+        monkeypatch.setattr(sys, "path", list(sys.path))
+        exec(_documented("from load import load"), found)
+        expected, boxes = detector(projection), found["detections"]["boxes"]
+    assert expected.is_valid.any()
+    np.testing.assert_allclose(boxes, expected.boxes, atol=1e-4)
+
+
+def test_the_documented_decoder_finds_the_boxes_before_nms(tmp_path, monkeypatch):
     detector, projection = small.detector(), small.projections(1)
     export.export(detector, tmp_path / "onnx", kind="huggingface")
     monkeypatch.chdir(tmp_path)
@@ -261,7 +288,7 @@ def test_the_documented_decoder_finds_the_boxes_before_nms(tmp_path, monkeypatch
     outputs = [np.asarray(maps.heatmap_logits), np.asarray(maps.box_params)]
     network = SimpleNamespace(run=lambda *_: outputs)
     found = {"network": network, "projection": projection}
-    exec(code, found)
+    exec(_documented("sliding_window_view"), found)
     settings = {"score_threshold": 0.3, "nms_iou": 1.0, "roi": (-99, 99) * 3}
     wanted = detector(projection, **settings)
     order = np.argsort(-found["best"], kind="stable")[: wanted.is_valid.sum()]
