@@ -74,6 +74,8 @@ def main(argv=None):
         return keep(name, int(number))
     words = args.readers.split(",")
     names = [name for name in READERS if any(word in name for word in words)]
+    if not names:
+        parser.error(f"no reader of {args.readers}; there are {', '.join(READERS)}")
     seconds = 60 * args.minutes / len(names)
     results = {name: fuzz(name, seconds, args.start) for name in names}
     print(table(results))

@@ -96,6 +96,7 @@ def run(chosen, seconds, store=lambda so_far: None):
                     not_run.append(f"{name} from {case.name}, {case.dtype} on")
                     break
                 rows.append({"benchmark": name} | measured(case, left))
+                del case  # free its arrays before the next case is built
         except Exception as error:  # the table lists it; others still run
             traceback.print_exc()
             rows.append({"benchmark": name, "name": name, "refused": repr(error)[:300]})
