@@ -19,6 +19,7 @@ import jax.export  # not a part of `import jax`
 import jax.numpy as jnp
 from flax import traverse_util
 
+import radejax
 from radejax.core import files
 from radejax.core.errors import UserError, require
 from radejax.core.structures import to_float
@@ -34,7 +35,15 @@ KNOWN_PLATFORMS = (*PLATFORMS, "rocm")
 FORMATS = ("stablehlo", "onnx", "huggingface")
 PROGRAM_FILE = "detector.stablehlo"
 BYTECODE_FILE = "detector.mlirbc"
-INPUTS_FILE = "inputs.json"
+OPTIONS_FILE = "compile_options.pb"
+INPUTS_FILE, OUTPUTS_FILE = "inputs.json", "outputs.json"
+_OF_PROGRAMS = (
+    *(PROGRAM_FILE, BYTECODE_FILE, OPTIONS_FILE, INPUTS_FILE, OUTPUTS_FILE),
+    *("load.py", "detector.onnx", "network.onnx"),
+)
+_COMPILE_OPTIONS = bytes.fromhex("1a0420012801")
+"""XLA's `CompileOptionsProto` for one replica and one partition."""
+
 
 CHUNK_SIZE = 1024
 """Default chunk size of the deformable attention in ONNX files, in bins."""
@@ -59,20 +68,23 @@ tags: [radar, 4d-radar, 3d-object-detection, k-radar, jax, flax]
 
 ## Input
 
-Projections [B, {shape}] float32: range, azimuth (bin 0 is the leftmost), then the Doppler
-channels and the elevation channels. For linear power p, a Doppler channel is the maximum over
-elevation and an elevation channel the maximum over Doppler, as
-(10 log10(p + 1e-10) + 1.2) / 184.3. Programs exported with `--input tensor` take the power
-[B, {tensor}] instead (Doppler, range, elevation, azimuth) and compute the projection.
-`inputs.json` lists the arrays of a program with one batch size.
+{input}
+
+For linear power p of a radar tensor [Doppler, range, elevation, azimuth], the projection is
+(10 log10(p + 1e-10) + 1.2) / 184.3, first of the maximum over elevation (Doppler channels), then
+of the maximum over Doppler (elevation channels). Azimuth bin 0 is the leftmost.
+
+Programs were exported with radejax {radejax} and JAX {jax}. `inputs.json` and `outputs.json` list
+their arrays by index. The thresholds of the config are in `config.decode` of `config.json`; a
+region of null there means no limit.
 
 ## Output
 
-Boxes [B, K, 7]: x (ahead), y (left), z (up) of the center, length, width and height in meters,
-and yaw in radians, counter-clockwise from x, in the frame of the radar, with z from the LiDAR.
-Scores [B, K] are sigmoids, classes [B, K] indices into the list above, and `is_valid` [B, K] is
-true for a detection. Programs contain network, decoding (maxima of 3 x 3 bins, score threshold)
-and rotated NMS, but no check of the values: NaN gives no detections.
+Boxes [B, {count}, 7]: x (ahead), y (left), z (up) of the center, length, width and height in
+meters, and yaw in radians, counter-clockwise from x, in the frame of the radar, with z from the
+LiDAR. Scores are sigmoids, classes indices into the list above, and `is_valid` is true for a
+detection; other rows are padding. Programs contain network, decoding (maxima of 3 x 3 bins, score
+threshold) and rotated NMS, but no check of the values: NaN gives no detections.
 
 `network.onnx` ends before the decoding. Its `heatmap_logits` [B, R, A, C] become scores by a
 sigmoid. Its `box_params` [B, R, A, 8] are dx and dy from the center of the bin to that of the
@@ -99,7 +111,7 @@ def export(
     half: bool = False,
     radar_input: str = "projection",
 ) -> dict[str, Any]:
-    """Write a folder with the model; existing files of the same names are replaced.
+    """Write a folder with the model; files of an earlier export are replaced or removed.
 
     Args:
         detector: Detector to export. Its thresholds and region of interest become the
@@ -146,25 +158,35 @@ def export(
         half=half,
         programs=programs,
     )
+    kept = {*programs, "load.py"} if kind == "stablehlo" else {*programs}
+    for name in set(_OF_PROGRAMS) - kept:
+        (folder / name).unlink(missing_ok=True)
     if kind == "stablehlo":
         loader = pathlib.Path(exported_loader.__file__)
         files.write_text(folder / "load.py", loader.read_text())
-    files.write_text(folder / "README.md", _readme(detector, content["left_out"]))
+    card = _readme(detector, is_tensor, content["left_out"])
+    files.write_text(folder / "README.md", card)
     return {
         "bytes": sum(p.stat().st_size for p in folder.rglob("*") if p.is_file()),
         "left_out": content["left_out"],
     }
 
 
-def _readme(detector: Detector, left_out: Sequence[str]) -> str:
+def _readme(detector: Detector, is_tensor: bool, left_out: Sequence[str]) -> str:
     """Return the text of the model card."""
+    grid = detector.grid
+    radar = f"Projections [B, {', '.join(map(str, grid.projection_shape))}] float32"
+    if is_tensor:
+        radar = f"Power [B, {', '.join(map(str, grid.shape_drea))}] float32 of radar tensors"
     config = detector.saved.config
     is_simulated = (config.get("simulation") or {}).get("scenes") == "procedural"
     return _README.format(
         name={"radenet": "RADE-Net", "dinorade": "DinoRADE"}[config.model.name],
         classes=", ".join(detector.classes),
-        shape=", ".join(map(str, detector.grid.projection_shape)),
-        tensor=", ".join(map(str, detector.grid.shape_drea)),
+        input=f"{radar}, B frames.",
+        radejax=radejax.__version__,
+        jax=jax.__version__,
+        count=config.decode.max_detections,
         left_out=_LEFT_OUT if left_out else "nothing",
         origin=_SIMULATED if is_simulated else _MEASURED,
     )
@@ -220,16 +242,21 @@ _UNITS = {
     "score_threshold": "0 to 1",
     "nms_iou": "0 to 1",
     "roi": "x0, x1, y0, y1, z0, z1 in m",
+    "boxes": "x, y, z, length, width, height in m, yaw in rad",
+    "scores": "0 to 1",
+    "classes": "index into config.classes, -1 for padding",
+    "is_valid": "true for a detection",
+    "num_truncated": "number of peaks and boxes that were dropped",
 }
 
 
 def _described(names: Sequence[str], arrays: Sequence[Any]) -> bytes:
-    """Return the content of `inputs.json`: a list of inputs in the order of a program."""
+    """Return a list of the inputs or outputs of a program as JSON, null for any size."""
     rows = [
         {
             "index": index,
             "name": name,
-            "shape": list(x.shape),
+            "shape": [n if isinstance(n, int) else None for n in x.shape],
             "dtype": str(x.dtype),
             "unit": _UNITS.get(name, "weights: the tensor in model.safetensors"),
         }
@@ -261,7 +288,7 @@ def _stablehlo(
 
     The result of the program is a dictionary of arrays. The batch size is symbolic if
     `batch_size` is None. Without the backbone, the images are embedded ones. With a batch
-    size and a single platform, the bytecode and `inputs.json` are returned too, from
+    size and a single platform, the bytecode and compile options are returned too, from
     which other languages can run the program.
     """
     batch = batch_size or jax.export.symbolic_shape("b")[0]
@@ -277,22 +304,24 @@ def _stablehlo(
     exported = jax.export.export(jax.jit(program), platforms=tuple(platforms))(
         weights, inputs, *settings
     )
-    contents = {PROGRAM_FILE: bytes(exported.serialize())}
+    names = [*sorted(weights), *_names(inputs), *SETTINGS]
+    kept = exported.module_kept_var_idx  # a program has only the inputs that it uses
+    used = [(names[i], exported.in_avals[i]) for i in kept]
+    contents = {
+        PROGRAM_FILE: bytes(exported.serialize()),
+        INPUTS_FILE: _described(*zip(*used, strict=True)),
+        OUTPUTS_FILE: _described(sorted(RESULTS), exported.out_avals),
+    }
     if batch_size and len(platforms) == 1:
-        names = [*sorted(weights), *_names(inputs), *SETTINGS]
-        kept = (
-            exported.module_kept_var_idx
-        )  # inputs that the program does not use are cut
-        used = [(names[i], exported.in_avals[i]) for i in kept]
         contents[BYTECODE_FILE] = exported.mlir_module_serialized
-        contents[INPUTS_FILE] = _described(*zip(*used, strict=True))
+        contents[OPTIONS_FILE] = _COMPILE_OPTIONS
     return contents
 
 
 def _onnx_files(
     detector: Detector, shape: Sequence[int], batch_size: int, with_backbone: bool
 ) -> dict[str, bytes]:
-    """Return the contents of the ONNX files and of `inputs.json` by name.
+    """Return the contents of the ONNX files and their inputs and outputs by file name.
 
     `network.onnx` contains the network, and `detector.onnx` also decoding and rotated NMS.
 
@@ -342,6 +371,7 @@ def _onnx_files(
         )
         return model.SerializeToString()
 
+    arguments = [*leaves, *(_array(*shape) for shape in SETTINGS.values())]
     # onnx_ir warns of every shape that is not static.
     logging.getLogger("onnx_ir").setLevel(logging.ERROR)
     with warnings.catch_warnings():
@@ -349,7 +379,6 @@ def _onnx_files(
         return {
             "network.onnx": convert(network, {}, ("heatmap_logits", "box_params")),
             "detector.onnx": convert(program, SETTINGS, RESULTS),
-            INPUTS_FILE: _described(
-                [*names, *SETTINGS], [*leaves, *(_array(*s) for s in SETTINGS.values())]
-            ),
+            INPUTS_FILE: _described([*names, *SETTINGS], arguments),
+            OUTPUTS_FILE: _described(RESULTS, jax.eval_shape(program, *arguments)),
         }

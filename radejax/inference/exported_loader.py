@@ -1,6 +1,6 @@
-"""Detects objects in radar projections without radejax: python load.py projection.npy [...].
+"""Detects objects in radar data without radejax: python load.py array.npy [...].
 
-It needs `pip install jax flatbuffers`.
+It needs `pip install jax flatbuffers`. README.md describes the arrays, here of one frame.
 """
 
 import hashlib
@@ -50,6 +50,8 @@ def load(folder: str | pathlib.Path = FOLDER, device: jax.Device | None = None):
     defaults["roi"] = decode.get("roi") or [-np.inf, np.inf] * 3
 
     def detect(*inputs, **settings):
+        if unknown := set(settings) - set(defaults):
+            raise TypeError(f"unknown {unknown}, expected {sorted(defaults)}")
         values = [np.asarray(x, np.float32) for x in {**defaults, **settings}.values()]
         # On CPU, device_put shares memory with arrays that the caller may overwrite, so
         # they are copied.

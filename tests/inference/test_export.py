@@ -102,8 +102,10 @@ def test_a_fresh_process_without_radejax_finds_the_same_boxes(tmp_path):
         "README.md",
         "config.json",
         "detector.stablehlo",
+        "inputs.json",
         "load.py",
         "model.safetensors",
+        "outputs.json",
     }
     assert done["bytes"] > (folder / "model.safetensors").stat().st_size
     exported = jax.export.deserialize((folder / "detector.stablehlo").read_bytes())
@@ -143,16 +145,20 @@ def test_a_program_of_one_batch_size_and_platform_has_static_shapes(tmp_path):
     given |= dict(zip(names, (projection, 0.1, 0.3, (-99, 99) * 3), strict=True))
     inputs = [np.asarray(given[row["name"]], row["dtype"]) for row in rows]
     assert [list(x.shape) for x in inputs] == [row["shape"] for row in rows]
-    found = _run_bytecode((tmp_path / "detector.mlirbc").read_bytes(), inputs)
+    found = _run_bytecode(tmp_path, inputs)
     wanted = detector(projection, roi=(-99, 99) * 3)
-    for name, value in zip(sorted(export.RESULTS), found, strict=True):
-        np.testing.assert_allclose(value, getattr(wanted, name), atol=1e-4)
+    rows = json.loads((tmp_path / "outputs.json").read_text())
+    for row, value in zip(rows, found, strict=True):
+        np.testing.assert_allclose(value, getattr(wanted, row["name"]), atol=1e-4)
+        assert [list(value.shape), str(value.dtype)] == [row["shape"], row["dtype"]]
 
 
-def _run_bytecode(program, inputs):
+def _run_bytecode(folder, inputs):
     """Compile and run StableHLO bytecode through PJRT, without `jax.export`."""
-    options = backend.get_compile_options(num_replicas=1, num_partitions=1)
+    kind = type(backend.get_compile_options(num_replicas=1, num_partitions=1))
+    options = kind.ParseFromString((folder / "compile_options.pb").read_bytes())
     devices = jaxlib_client.DeviceList(tuple(jax.devices("cpu")[:1]))
+    program = (folder / "detector.mlirbc").read_bytes()
     loaded = backend.get_backend("cpu").compile_and_load(program, devices, options)
     results = loaded.execute_sharded([jax.device_put(x) for x in inputs])
     return [np.asarray(x[0]) for x in results.disassemble_into_single_device_arrays()]
@@ -170,6 +176,20 @@ def test_a_program_that_begins_with_the_tensor(tmp_path):
     rows = json.loads((tmp_path / "inputs.json").read_text())
     assert rows[-4]["name"] == "tensor"
     assert rows[-4]["unit"] == "linear power"
+    assert "Power [B, 2, 16, 3, 14] float32" in (tmp_path / "README.md").read_text()
+    # Another export into the same folder removes what it does not write.
+    export.export(detector, tmp_path, platforms=("cpu",))
+    assert not (tmp_path / "detector.mlirbc").exists()
+    rows = json.loads((tmp_path / "inputs.json").read_text())
+    assert (rows[-4]["name"], rows[-4]["shape"][0]) == ("projection", None)
+    assert "Projections [B, 16, 14, 5] float32" in (tmp_path / "README.md").read_text()
+    with pytest.raises(
+        TypeError, match=r"unknown {'iou'}, expected \['nms_iou', 'roi'"
+    ):
+        exported_loader.load(tmp_path)(small.projections(1), iou=0.5)
+    export.export(detector, tmp_path, kind="huggingface")
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"README.md", "config.json", "model.safetensors"}
 
 
 @pytest.mark.slow
@@ -244,6 +264,8 @@ def test_onnx_files_give_the_same_boxes(kind, tmp_path):
     session = runtime.InferenceSession(tmp_path / "detector.onnx")
     assert [row["name"] for row in rows] == [x.name for x in session.get_inputs()]
     assert [row["shape"] for row in rows] == [x.shape for x in session.get_inputs()]
+    rows = json.loads((tmp_path / "outputs.json").read_text())
+    assert [row["name"] for row in rows] == [x.name for x in session.get_outputs()]
     for name, values in run("network.onnx", inputs).items():
         np.testing.assert_allclose(values, getattr(maps, name), atol=1e-4)
 
