@@ -23,6 +23,7 @@ from radejax.data.pipeline import camera_inputs
 from radejax.data.records import preprocess
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOLS
+from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.detect_files import detect_files
 from radejax.losses.detection import LOSSES
 from radejax.models.backbone import BACKBONES
@@ -88,7 +89,7 @@ def _write_toy(root: pathlib.Path) -> pathlib.Path:
 
 
 def test_the_page_has_every_kind_of_part() -> None:
-    assert len(BLOCKS) == len(NAMES) + 1
+    assert len(BLOCKS) == len(NAMES) + 2
     for names, name in zip(
         NAMES, ("strip", "wide", "flat", "height", "free101"), strict=True
     ):
@@ -105,6 +106,19 @@ def test_configs_may_name_the_parts_and_the_model_has_them() -> None:
     assert "Conv_1" in made["neck"]
     assert made["heads"]["box"]["conv_1"]["conv"]["kernel"].shape[-1] == 16
     assert len(made["backbone"]) == 3
+
+
+def test_the_config_of_the_page_is_complete() -> None:
+    (block,) = (block for block in BLOCKS if "def get_config" in block)
+    found: dict[str, Any] = {}
+    exec(block, found)
+    checks.check(found["get_config"]())
+
+
+def test_the_grid_of_the_page_is_read() -> None:
+    (block,) = re.findall(r"^```json\n(.*?)^```", PAGE.read_text(), re.MULTILINE | re.S)
+    grid = RadarGrid.from_dict(json.loads(block))
+    assert grid.shape_drea == (3, 3, 2, 3)
 
 
 def test_the_toy_data_set_gives_what_a_run_asks(tmp_path: pathlib.Path) -> None:
@@ -158,6 +172,10 @@ def test_objects_that_cannot_be_learned_are_left_out_and_counted(
     config = _config()
     config.data.roots = (str(root),)
     data = Data(config, models.build(config.model))
+    config.data.sequences = (2,)
+    part = Data(config, models.build(config.model))
+    assert [frame.sequence for frame in part.frames] == [2, 2]
+    config.data.sequences = ()
     assert data.frames[0].boxes.tolist() == [good]
     assert data.split("train")[0].classes.tolist() == ["Sedan"]
     counts = data.frames.summary().counts

@@ -206,6 +206,18 @@ class LabelledFrames(Sequence[_F]):
         counts[f"frames left out: {reason}"] += len(self) - len(other)
         return other
 
+    def part(
+        self, sequences: Collection[int] | None, weather: Collection[str] | None
+    ) -> Self:
+        """Returns the frames of some sequences and weathers; None or empty for all."""
+        left_out = {
+            frame.key
+            for frame in self
+            if (sequences and frame.sequence not in sequences)
+            or (weather and frame.weather not in weather)
+        }
+        return self.without(left_out, "other sequences or weather")
+
     def with_valid_boxes(self) -> Self:
         """Returns the dataset without objects that no detector can learn.
 

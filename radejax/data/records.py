@@ -386,6 +386,8 @@ def _write(records: Records, frame: LabelledFrame) -> tuple[str, str]:
         projection = frame.read_projection(records.grid)
     except (DataError, OSError) as error:
         return frame.key, str(error)
+    if projection.shape != records.shape:
+        return frame.key, f"projection of shape {projection.shape}, not {records.shape}"
     if "reader" in records.source:
         files.write_json(records.path(frame.key).with_suffix(".json"), _file_of(frame))
     records.write(frame.key, encode(projection, records.dtype))

@@ -234,7 +234,7 @@ def sanity_checks(data: EvaluationSet) -> list[str]:
         >>> sanity_checks(data)
         []
     """
-    box, lines = data.predictions.box, []
+    box, lines = data.predictions.box, list[str]()
     is_large = np.abs(box[:, 6]) > 2 * np.pi
     if is_large.any():
         lines.append(
@@ -246,6 +246,12 @@ def sanity_checks(data: EvaluationSet) -> list[str]:
         lines.append(
             f"{behind} of {len(box)} predictions lie behind the sensor (x < 0): boxes are "
             "in the radar frame, x forward, y left, z up"
+        )
+    outside = data.left_out["ground truth: center outside the region of interest"]
+    if outside > 2 * len(data.gt):
+        lines.append(
+            f"{outside} of {outside + len(data.gt)} objects are outside the region "
+            f"{data.roi} and not counted: --roi none, or evaluation.roi of the config"
         )
     return lines + _constant_offset(data)
 

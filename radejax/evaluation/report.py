@@ -161,7 +161,7 @@ def _tables(
     """Builds the tables in the papers' layouts, of all protocols and IoUs, and of details."""
     ious, subsets = options.iou_thresholds, metrics["subsets"]
     built = []
-    if not metrics["is_simulated"]:
+    if not metrics["is_simulated"] and metrics["options"]["label_version"]:
         built += paper_tables(metrics["run"], results, options, metrics["split"])
     for space, iou in itertools.product(SPACES, ious):
         built.append(by_protocol(results, options, space, iou))

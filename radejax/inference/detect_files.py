@@ -271,7 +271,10 @@ def _frames(
         classes=config.classes,
         sequence_numbers=sequence_numbers,
         weather=weather,
-    )
+    ).part(sequence_numbers, weather)
+    if not len(frames):
+        named = ", ".join(map(str, roots))
+        raise UserError(f"no frames in {named}: give the roots of the dataset")
     if detector.grid != frames.grid:
         raise UserError(f"{roots[0]}: the radar has other axes than that of the run")
     images: list[Any] = []

@@ -337,7 +337,7 @@ def _onnx_files(
         from jax2onnx import to_onnx
     except ModuleNotFoundError as error:
         raise UserError(
-            'format "onnx" needs jax2onnx: pip install "radejax[onnx]"'
+            "format onnx needs jax2onnx: pip install -e '.[onnx]'"
         ) from error
 
     # With a fixed chunk size, the program does not choose by platform, which jax2onnx

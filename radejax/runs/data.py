@@ -96,7 +96,8 @@ class Data:
             weather=options.weather or None,
         )
         if options.format != "kradar":  # the reader of K-Radar checks its labels itself
-            self.frames = self.frames.with_valid_boxes()
+            chosen = options.sequences, options.weather
+            self.frames = self.frames.with_valid_boxes().part(*chosen)
 
     def preprocess(self) -> None:
         """Write the missing records on the main process while the others wait.

@@ -56,6 +56,7 @@ _BEHIND_M = 2.0  # shown behind the sensor, so that its mark is whole
 _POINTS_PER_EDGE = 8  # straight edges bend in the polar view
 _SCENE_PERCENTILES = (20.0, 99.5)
 _FOOT_IN = 0.8  # legend and color bar below scenes
+_IMAGE_IN = 2.25  # image above a map
 _COLUMN_IN, _ROW_IN = 4.9, 8.0  # large enough for scores of crowded scenes
 
 
@@ -216,7 +217,11 @@ def draw_scenes(scenes: Sequence[Scene]) -> Figure:
         raise UserError("no scenes to draw")
     columns = min(4, len(scenes))
     width = _COLUMN_IN * columns
-    height = _ROW_IN * -(-len(scenes) // columns) + _FOOT_IN
+    has_image = any(scene.image is not None for scene in scenes)
+    row_in = _ROW_IN if has_image else _ROW_IN - _IMAGE_IN
+    # The legend is above the color bar if both do not fit next to each other.
+    foot_in = _FOOT_IN if columns > 2 else 2 * _FOOT_IN
+    height = row_in * -(-len(scenes) // columns) + foot_in
     figure = new_figure(width, height)
     # All scenes share one color scale. The few strongest echoes are beyond its limits.
     values = [scene.power.ravel() for scene in scenes]
@@ -225,7 +230,7 @@ def draw_scenes(scenes: Sequence[Scene]) -> Figure:
     for index, scene in enumerate(scenes):
         row, column = divmod(index, columns)
         left, across = (column + 0.14) / columns, 0.83 / columns
-        base = height - _ROW_IN * (row + 1) - 0.05  # inches
+        base = height - row_in * (row + 1) - 0.05  # inches
         above = None
         if scene.image is not None:
             place = (left, (base + 5.55) / height, across, 2.15 / height)
@@ -249,7 +254,7 @@ def draw_scenes(scenes: Sequence[Scene]) -> Figure:
     figure.legend(
         handles=_legend_handles(scenes[0], show_counts=False),
         loc="lower left",
-        bbox_to_anchor=(0.3 / width, 0.2 / height),
+        bbox_to_anchor=(0.3 / width, (foot_in - _FOOT_IN + 0.2) / height),
         ncols=3 if columns > 1 else 1,
         frameon=False,
     )
