@@ -19,7 +19,9 @@ from radejax.core.errors import UserError
 from radejax.data.cameras import CameraOptions
 from radejax.data.dataset import data_set
 from radejax.data.kradar import KRadar
+from radejax.data.kradar.check import check_dataset
 from radejax.data.pipeline import camera_inputs
+from radejax.data.projection import project_tensor
 from radejax.data.records import preprocess
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOLS
@@ -185,6 +187,28 @@ def test_objects_that_cannot_be_learned_are_left_out_and_counted(
     np.savez(path, **content | {"boxes": np.array([[*good[:6], 90.0]] * 5)})
     with pytest.raises(UserError, match=r"frame 1/0001: yaw is 90, expected radians"):
         Data(config, models.build(config.model))
+
+
+def test_written_folders_are_read_and_a_frame_is_drawn(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    written, drawn = re.findall(r"^```py\n(.*?)^```", text, re.MULTILINE | re.S)
+    monkeypatch.chdir(tmp_path)
+    power = np.random.default_rng(0).exponential(1e3, (32, 64, 2, 48))
+    box = (20.0, 1.0, 0.0, 4.2, 1.8, 1.6, 0.1)
+    recording = [(power.astype(np.float32), [("Sedan", box)])] * 4
+    exec(written, {"recording": recording})
+    assert check_dataset("own").num_problems == 0
+    frames = KRadar("own", split="train")
+    assert [frame.key for frame in frames] == ["1/00001_00001", "1/00002_00002"]
+    np.testing.assert_allclose(frames[0].boxes, [box])
+    projection = frames[0].read_projection(frames.grid)
+    np.testing.assert_array_equal(projection, project_tensor(recording[0][0]))
+    _write_toy(tmp_path / "ROOT")
+    exec(drawn.replace('("Car", "Pedestrian")', '("Sedan",)'), {})
+    with Image.open("frame.png") as figure:
+        assert figure.width > 1000
 
 
 def test_the_protocol_counts_every_frame() -> None:
