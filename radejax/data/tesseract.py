@@ -75,11 +75,11 @@ def project_file(
     """
     with _opened(path, shape_drea) as (file, layout):
         if layout.deflated is None and layout.dtype.kind == "f":
-            lowest = next(_read_columns(file, layout)).min()
+            lowest = float(next(_read_columns(file, layout)).min())
             projection = project_columns(_read_columns(file, layout), layout.shape)
         else:
             tensor = _read_array(file, layout)
-            lowest, projection = tensor[..., 0].min(), project_tensor(tensor)
+            lowest, projection = float(tensor[..., 0].min()), project_tensor(tensor)
     beams = projection[..., layout.shape[0] :].max(axis=0)
     if problem := find_problem(beams, lowest):
         raise DataError(f"{path}: corrupted, {VARIABLE} is not linear power: {problem}")
