@@ -96,7 +96,7 @@ def write_tesseract(
     *,
     compress: bool = False,
 ) -> None:
-    """Writes a tesseract in K-Radar's format: MATLAB v5, variable `arrDREA`, column-major.
+    """Writes a radar tensor as in K-Radar: MATLAB v5, variable `arrDREA`, column-major.
 
     MATLAB's creation date is left out, so that equal tensors give identical files.
 
