@@ -131,6 +131,16 @@ def train(
             return run.take_steps(train_step, state, profile)
 
 
+def _trace(folder: str) -> contextlib.AbstractContextManager[None]:
+    """Writes a profiler trace of a block, without the calls of Python functions.
+
+    Stopping the tracer of Python functions can crash the process while threads are running.
+    """
+    options = jax.profiler.ProfileOptions()
+    options.python_tracer_level = 0
+    return jax.profiler.trace(folder, profiler_options=options)
+
+
 @dataclasses.dataclass
 class _Run:
     """Takes the steps of a run; the attributes are arguments and objects of `train`."""
@@ -159,7 +169,7 @@ class _Run:
             while step < num_steps and not is_stopped:
                 batch = self.logger.next_batch(self.loader, metrics)
                 if profile and step == first:
-                    trace.enter_context(jax.profiler.trace(profile))
+                    trace.enter_context(_trace(profile))
                 state, metrics = train_step(state, batch)
                 if profile and step == last:
                     jax.block_until_ready(metrics)
