@@ -28,7 +28,9 @@ LOG_SCALE_DB = 184.3
 MAX_LEVEL = 100.0
 """Bound on the absolute value of a level; any power in float64 gives -0.54 to 17."""
 
-_MAX_ZERO_SHARE = 0.05
+MAX_ZERO_SHARE = 0.05
+"""Largest fraction of exact zeros, which noise never gives, in data of a radar."""
+
 _MAX_DECIBELS = 300.0
 _DECIBEL_LEVEL = (10 * math.log10(_MAX_DECIBELS) + LOG_OFFSET_DB) / LOG_SCALE_DB
 _LOWEST_LEVEL = (10 * math.log10(2 * POWER_FLOOR) + LOG_OFFSET_DB) / LOG_SCALE_DB
@@ -170,7 +172,7 @@ def find_problem(
     if not (lowest_power >= 0 and (np.abs(beams) <= MAX_LEVEL).all()):  # also if NaN
         return "some values are negative, infinite or NaN"
     share = np.mean(beams < _LOWEST_LEVEL)
-    if share > _MAX_ZERO_SHARE:
+    if share > MAX_ZERO_SHARE:
         return f"{share:.0%} of the beams have a power of exactly 0 at every range"
     if lowest_power > 1 and beams.max() <= _DECIBEL_LEVEL:
         return f"all values are between 1 and {_MAX_DECIBELS:g}, as in decibels"

@@ -337,7 +337,7 @@ def preprocess(
 
 
 def _file_of(frame: LabelledFrame) -> list[Any] | None:
-    """Returns name, size and modification time of each frame's radar file, if it exists."""
+    """Returns name, size and modification time of a frame's radar file, if it exists."""
     if frame.radar_path is None or not frame.radar_path.exists():
         return None
     found = frame.radar_path.stat()

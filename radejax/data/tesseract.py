@@ -33,6 +33,7 @@ from radejax.core.errors import DataError
 from radejax.core.files import PathLike, as_path
 from radejax.data.projection import (
     MAX_LEVEL,
+    MAX_ZERO_SHARE,
     find_problem,
     project_columns,
     project_tensor,
@@ -40,8 +41,6 @@ from radejax.data.projection import (
 from radejax.geometry.radar_grid import RadarGrid
 
 VARIABLE = "arrDREA"
-
-_MAX_ZERO_SHARE = 0.05
 
 
 def read_tesseract(
@@ -129,7 +128,7 @@ def read_projection_npy(
             f"{path}: corrupted, {int((~is_possible).sum())} of {stored.size} values are "
             f"not finite or beyond {MAX_LEVEL:g}, which no power gives"
         )
-    if (share := np.mean(stored == 0)) > _MAX_ZERO_SHARE:
+    if (share := np.mean(stored == 0)) > MAX_ZERO_SHARE:
         raise DataError(f"{path}: corrupted, {share:.0%} of the values are exactly 0")
     return np.ascontiguousarray(stored.transpose(axes))
 

@@ -187,7 +187,7 @@ def detect_files(
     needed = ("pandas", "pyarrow") if file_format == "parquet" else ()
     if lacking := [name for name in needed if importlib.util.find_spec(name) is None]:
         raise UserError(
-            f"format parquet needs {' and '.join(lacking)}: pip install them"
+            f"format parquet needs {' and '.join(lacking)}: pip install {' '.join(lacking)}"
         )
     detector = Detector.from_workdir(source, step, image_backbone=image_backbone)
     is_kradar = detector.saved.config.data.format == "kradar"
