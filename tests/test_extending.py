@@ -176,7 +176,10 @@ def test_objects_that_cannot_be_learned_are_left_out_and_counted(
     data = Data(config, models.build(config.model))
     config.data.sequences = (2,)
     part = Data(config, models.build(config.model))
-    assert [frame.sequence for frame in part.frames] == [2, 2]
+    assert [frame.sequence for frame in part.split("test")] == [2, 2]
+    config.data.sequences = (1,)  # of the train split
+    with pytest.raises(UserError, match="no frames of the test split"):
+        Data(config, models.build(config.model)).split("test")
     config.data.sequences = ()
     assert data.frames[0].boxes.tolist() == [good]
     assert data.split("train")[0].classes.tolist() == ["Sedan"]

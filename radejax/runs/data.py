@@ -96,8 +96,7 @@ class Data:
             weather=options.weather or None,
         )
         if options.format != "kradar":  # the reader of K-Radar checks its labels itself
-            chosen = options.sequences, options.weather
-            self.frames = self.frames.with_valid_boxes().part(*chosen)
+            self.frames = self.frames.with_valid_boxes()
 
     def preprocess(self) -> None:
         """Write the missing records on the main process while the others wait.
@@ -109,7 +108,7 @@ class Data:
                 or no space is left on the disk.
         """
         report = distributed.main_only(
-            lambda: records.preprocess(self.frames, self.options.records)
+            lambda: records.preprocess(self._chosen(self.frames), self.options.records)
         )
         if report is not None and report.skipped:
             _log.warning("%s", report.to_text())
@@ -141,6 +140,9 @@ class Data:
                 frames = self._part_of_train(name)
             else:
                 frames = self.frames if name == "all" else self.frames.of_split(name)
+            # Splits of other readers may depend on which sequences there are, so that the
+            # chosen frames are selected afterwards.
+            frames = self._chosen(frames)
             if any(frame.key in self._skipped for frame in frames):
                 frames = frames.without(self._skipped, "no readable radar tensor")
             self._splits[name] = frames
@@ -148,6 +150,12 @@ class Data:
             roots = ", ".join(self.options.roots)
             raise UserError(f"no frames of the {name} split in {roots}")
         return self._splits[name]
+
+    def _chosen(self, frames: LabelledFrames) -> LabelledFrames:
+        """Return the frames of the chosen sequences and weathers; `KRadar` has only these."""
+        if self.options.format == "kradar":
+            return frames
+        return frames.part(self.options.sequences, self.options.weather)
 
     def _part_of_train(self, name: str) -> LabelledFrames:
         """Return the part of the train split that is trained on, or is held out.
