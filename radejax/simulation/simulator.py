@@ -305,7 +305,7 @@ class LabelSource:
             is_test = [names[index] not in train for index in chosen]
             first_test = is_test.index(True) if True in is_test else 0
             start = first_test - (count + 1) // 2 if count <= first_test else 0
-            chosen = chosen[max(start, 0) :][:count]
+            chosen = chosen[start : start + count]
         return [
             FrameSpec(
                 scene_idx=index,
