@@ -106,12 +106,16 @@ def test_the_package_is_imported_from_the_folder_above_a_clone(
     (clone / "radejax").mkdir(parents=True)
     for name in ("pyproject.toml", "README.md", "radejax/__init__.py"):
         shutil.copy(ROOT / name, clone / name)
-    script = f"from setuptools import build_meta; build_meta.build_editable({str(site)!r})"
+    script = (
+        f"from setuptools import build_meta; build_meta.build_editable({str(site)!r})"
+    )
     site.mkdir()
     subprocess.run([sys.executable, "-c", script], cwd=clone, check=True)
     (wheel,) = site.glob("*.whl")
     zipfile.ZipFile(wheel).extractall(site)
-    script = f"import site; site.addsitedir({str(site)!r}); import radejax; print(radejax)"
+    script = (
+        f"import site; site.addsitedir({str(site)!r}); import radejax; print(radejax)"
+    )
     done = subprocess.run(
         [sys.executable, "-ESc", script], cwd=tmp_path, capture_output=True, text=True
     )
