@@ -23,6 +23,7 @@ import functools
 import importlib.resources
 import itertools
 import pathlib
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -459,8 +460,9 @@ class PublishedRow:
             f"labels={self.label_version}{origin}",
             f"roi={self.region}",
         )
-        unknown = ("score>not stated", "roi=not stated")
-        return ", ".join(term for term in terms if term not in unknown)
+        return ", ".join(
+            term for term in terms if not re.search("[>=]not stated", term)
+        )
 
     def differences(
         self,

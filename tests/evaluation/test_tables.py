@@ -78,7 +78,14 @@ def test_rows_of_other_sources_as_printed():
         ("L4DR, logs/v1.1.txt", "L4DR", "v1.1", "Sedan", "bev", 0.5): "77.54",
         ("L4DR, logs/v2.1.txt", "L4DR", "v2.1", "Bus or Truck", "3d", 0.5): "39.11",
         ("DPFT, README.md", "DPFT", "v2.0", "Sedan", "3d", 0.3): "50.5",
-        ("SRF, abstract", "SRF", "v2.0", "mean", "3d", 0.3): "54.3",
+        (
+            "SRF, abstract",
+            "SRF, classes not stated",
+            "v2.0",
+            "mean",
+            "3d",
+            0.3,
+        ): "54.3",
     }.items():
         assert found[key] == text
     assert len(found) == 47
@@ -226,7 +233,7 @@ def _differences(rows):
 def test_a_difference_is_printed_where_protocol_labels_region_and_split_agree(real):
     one, two, three, ablations, others = _tables(real)
     assert _differences(one) == []  # of labels v1.1
-    origin = "not stated; the authors' release"
+    origin = "from the authors' release"
     terms = f"coco101, score>0.3, labels=v1.1 ({origin}), roi=narrow"
     row = ["RADE-Net (R)", "3D", "RADE-Net, Table I", terms, "64.1", "60.7"]
     assert row in [row[:6] for row in one]
@@ -258,7 +265,9 @@ def test_a_difference_is_printed_where_protocol_labels_region_and_split_agree(re
         "55.12",
     ]
     assert row in others
-    assert ["SRF (RC)", "mean", "SRF, abstract"] in [row[:3] for row in others]
+    assert ["SRF, classes not stated (RC)", "mean", "SRF, abstract"] in [
+        row[:3] for row in others
+    ]
 
 
 @pytest.mark.parametrize(
