@@ -23,7 +23,8 @@ set -euo pipefail
 
 # Slurm sends USR1 to this script 120 s before the time limit. The processes then receive
 # SIGTERM, save a checkpoint and stop, and the job returns to the queue. A run that ends by
-# itself, with or without an error or an evaluation, is never queued again.
+# itself, with or without an error or an evaluation, is never queued again. After a
+# preemption or the failure of a node, Slurm requeues the job (--requeue).
 is_stopped=false
 stop() {
     is_stopped=true
