@@ -99,6 +99,15 @@ def _by_distance(data: EvaluationSet, match: Int[np.ndarray, " M"]) -> Masks:
     return bands
 
 
+def distance_sets(data: EvaluationSet, iou: float) -> dict[str, EvaluationSet]:
+    """Returns the evaluation set of each distance band of `subsets`.
+
+    In `all_point` and 3D, predictions match the same objects as among all boxes.
+    """
+    bands = _by_distance(data, matched_objects(data, "3d", iou))
+    return {name: data.of_boxes(*both, data.frame) for name, both in bands.items()}
+
+
 def _numbers(
     data: EvaluationSet,
     cls: int,

@@ -140,7 +140,7 @@ class EvaluationSet:
         self.is_simulated = bool(np.any(frames.get("simulated", False)))
         self._roi = roi
         self.left_out: dict[str, int] = {}
-        self.gt, _ = self._select(truth, "ground truth")
+        self.gt, self._gt_row = self._select(truth, "ground truth")
         self.pred, self._pred_row = self._select(found, "predictions")
         assert self.pred.score is not None  # read_boxes requires it
         self.score = self.pred.score
@@ -185,14 +185,34 @@ class EvaluationSet:
         shape = self.frame.size, len(self.classes)
         return np.bincount(group, minlength=shape[0] * shape[1]).reshape(shape)
 
+    def evaluated(
+        self,
+        is_object: Bool[np.ndarray, " N"] | slice = slice(None),
+        is_found: Bool[np.ndarray, " M"] | slice = slice(None),
+    ) -> tuple[Boxes, Boxes]:
+        """Returns the objects and predictions of masks of `gt` and `pred` as given."""
+        rows = np.sort(self._gt_row[is_object]), np.sort(self._pred_row[is_found])
+        return self.ground_truth.take(rows[0]), self.predictions.take(rows[1])
+
     def of_frames(self, is_chosen: Bool[np.ndarray, " F"]) -> EvaluationSet:
         """Returns the evaluation set of some frames, such as those of one condition."""
-        ids = self.frame[is_chosen]
-        tables = self.ground_truth, self.predictions
+        chosen = is_chosen[self.gt.frame], is_chosen[self.pred.frame]
+        return self.of_boxes(*chosen, self.frame[is_chosen])
+
+    def of_boxes(
+        self,
+        is_object: Bool[np.ndarray, " N"],
+        is_found: Bool[np.ndarray, " M"],
+        frame: Int[np.ndarray, " K"],
+    ) -> EvaluationSet:
+        """Returns the evaluation set of masks of `gt` and `pred` in the given frames."""
         return EvaluationSet(
-            *(table.take(np.isin(table.frame, ids)) for table in tables),
+            *self.evaluated(is_object, is_found),
             classes=self.classes,
-            frames={"frame": ids, "simulated": np.full(ids.size, self.is_simulated)},
+            frames={
+                "frame": frame,
+                "simulated": np.full(frame.size, self.is_simulated),
+            },
             roi=self._roi,
             label_version=self.label_version,
         )

@@ -48,7 +48,19 @@ _RANGES = {
     "invalid_sizes": one_of("error", "false_positive"),
     "batch_size": integer(1),
     "num_visualizations": integer(0),
+    "figures": one_of("png", "pdf"),
 }
+
+
+SAME_NUMBERS = (
+    "bootstrap",
+    "plots",
+    "batch_size",
+    "num_visualizations",
+    "figures",
+    "kitti",
+)
+"""Fields of `EvaluationOptions` that do not change the APs."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,6 +82,8 @@ class EvaluationOptions:
         plots: Whether to draw curves.
         batch_size: Number of frames per batch of predictions.
         num_visualizations: Number of frames to draw.
+        figures: Format of the figures, "png" or "pdf".
+        kitti: Whether to write the boxes as text files for K-Radar's evaluation script.
     """
 
     classes: tuple[str, ...] = CLASSES
@@ -85,6 +99,8 @@ class EvaluationOptions:
     plots: bool = True
     batch_size: int = 8
     num_visualizations: int = 8
+    figures: str = "png"
+    kitti: bool = False
 
     def __post_init__(self) -> None:
         check_options(vars(self), "config.evaluation", _RANGES)
