@@ -78,7 +78,9 @@ class Comparison:
         high: Upper end of this interval.
         p_value: Two-sided p-value. If the difference is not tested, it is computed from
             the fraction of resamples in which the difference has the less frequent sign.
-        p_adjusted: p-value after Holm's correction over all rows of the same kind.
+        p_adjusted: p-value after Holm's correction over all rows of the same kind; for
+            weathers and distances not below the smallest one over all frames, so that
+            equal runs differ in any row with a probability of at most 5 %.
         is_significant: Whether `p_adjusted` is below 0.05; None if the difference is not
             tested, because a run has fewer than `MIN_SEEDS` seeds.
     """
@@ -159,10 +161,12 @@ def compare(
                     values = _difference(a, b, is_paired, np.unique(of_frame).size)
                     rows.append(Comparison(kind, condition, cls, *terms, *values))
     is_tested = min(len(run_a), len(run_b)) >= MIN_SEEDS
-    adjusted = []
-    for kind in dict.fromkeys(row.kind for row in rows):
-        group = [row for row in rows if row.kind == kind]
-        for row, p in zip(group, _holm([row.p_value for row in group]), strict=True):
+    adjusted, least = list[Comparison](), 0.0
+    for _, kind in itertools.groupby(rows, lambda row: row.kind):
+        group = list(kind)
+        found = np.maximum(_holm([row.p_value for row in group]), least).tolist()
+        least = least or min(found)  # of all frames, which are the first group
+        for row, p in zip(group, found, strict=True):
             verdict = p < 1 - LEVEL if is_tested else None
             adjusted.append(
                 dataclasses.replace(row, p_adjusted=p, is_significant=verdict)
