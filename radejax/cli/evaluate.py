@@ -80,11 +80,8 @@ _SETTINGS = together(
     ),
     group="Metrics",
 )
-_FIGURES = click.option(
-    "--figures",
-    type=click.Choice(["png", "pdf"]),
-    help="Format of the figures. Default: png.",
-)
+_FORMAT = click.Choice(["png", "pdf"])
+_FIGURES = click.option("--figures", type=_FORMAT, help="Format. Default: png.")
 _PREDICTIONS = together(
     click.option(
         "--ground-truth",
@@ -164,11 +161,7 @@ def evaluate(
 @_DATA
 @_PREDICTIONS
 @_FIGURES
-@click.option(
-    "--kitti",
-    is_flag=True,
-    help="Also write the evaluated boxes to kitti/ for K-Radar's own evaluation script.",
-)
+@click.option("--kitti", is_flag=True, help="Also write files for K-Radar's script.")
 @_SETTINGS
 @entry.json_option
 def score(
@@ -187,7 +180,7 @@ def score(
 
     path = pathlib.Path(predictions)
     folder = out or path.with_name(f"{path.stem}_evaluation")
-    source, settings = _source_and_settings(path, options, bootstrap=200)
+    source, settings = _settings(path, _given(options), bootstrap=200)
     report = evaluate_files(path, folder, source, settings, run=name or path.stem)
     entry.echo_result(as_json, report.metrics, f"{report.text}\nWritten to {folder}")
 
@@ -213,7 +206,7 @@ def compare(
     """
     from radejax.evaluation.comparison import compare_files
 
-    source, settings = _source_and_settings(runs[0], options, bootstrap=2000)
+    source, settings = _settings(runs[0], _given(options), bootstrap=2000)
     text, rows = compare_files(runs, out, source, settings)
     entry.echo_result(as_json, rows, text.rstrip("\n"))
 
@@ -228,9 +221,7 @@ def _given(options: dict[str, Any]) -> dict[str, Any]:
     return given
 
 
-def _source_and_settings(
-    path: Any, options: dict[str, Any], bootstrap: int
-) -> tuple[Any, Any]:
+def _settings(path: Any, given: dict[str, Any], bootstrap: int) -> tuple[Any, Any]:
     """Builds `Source` and `EvaluationOptions` from the options that are their fields.
 
     Options that are not given are those of the report in `path` or of the ground truth.
@@ -238,10 +229,10 @@ def _source_and_settings(
     from radejax.evaluation.files import Source, stored_options
     from radejax.evaluation.results import EvaluationOptions
 
-    given, values = _given(options), {"label_version": "v2.1", "bootstrap": bootstrap}
-    if "ground_truth" in given:
-        values |= stored_options(given["ground_truth"])
-    values |= stored_options(path) | given
+    values: dict[str, Any] = {"label_version": "v2.1"}
+    for place in filter(None, (given.get("ground_truth"), path)):
+        values |= stored_options(place)
+    values |= {"bootstrap": bootstrap} | given
 
     def made(kind: Any) -> Any:
         names = [field.name for field in dataclasses.fields(kind)]

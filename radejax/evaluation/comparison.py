@@ -28,19 +28,11 @@ from scipy.special import stdtrit
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.core.files import PathLike
-from radejax.evaluation import protocols
+from radejax.evaluation import protocols, report
 from radejax.evaluation.analysis import distance_sets
 from radejax.evaluation.boxes import Columns
 from radejax.evaluation.evaluation_set import SPACES, EvaluationSet
-from radejax.evaluation.files import Source, load, report_folders, stored_from
-from radejax.evaluation.report import (
-    Table,
-    number,
-    numbers,
-    plain,
-    rendered,
-    write_tables,
-)
+from radejax.evaluation.files import Source, load, report_folders, stored_options
 from radejax.evaluation.results import (
     LEVEL,
     EvaluationOptions,
@@ -53,6 +45,8 @@ from radejax.evaluation.results import (
 
 MIN_SEEDS = 3
 """Number of seeds that both runs need for a test of their difference."""
+
+Aps = Float[np.ndarray, "_ _"]
 
 Run = Mapping[str, EvaluationSet]
 """Evaluation sets of the trainings of a run by the names of their seeds."""
@@ -139,7 +133,7 @@ def compare(
     bands = [distance_sets(data, iou) for data in sets]
     for name in bands[0]:
         parts.append(("distance", name, [band[name] for band in bands], sequence))
-    classes, is_paired, rows = sets[0].classes, run_a.keys() == run_b.keys(), []
+    classes, is_paired, rows = sets[0].classes, [*run_a] == [*run_b], []
     for kind, condition, chosen, of_frame in parts:
         names = options.main_protocols[:2] if kind == "all" else [protocols.RECOMMENDED]
         # The first row counts every frame once, which gives the APs over all frames.
@@ -148,44 +142,35 @@ def compare(
             drawn = sequence_weights(of_frame, resamples=options.bootstrap, seed=0)
             weights = np.concatenate([weights, drawn])
         for protocol, space in itertools.product(names, spaces):
-            settings = options.settings_of(protocol)
-            metric = protocol, space, iou
-            samples = np.stack(
-                [resample(data, weights, *metric, **settings) for data in chosen]
-            )
-            terms = space, iou, protocol, settings["score_threshold"]
+            metric, terms = (protocol, space, iou), options.settings_of(protocol)
+            aps = np.stack([resample(x, weights, *metric, **terms) for x in chosen])
+            shown = space, iou, protocol, terms["score_threshold"]
             # With a single class, the mean would be the same row again.
             for index, cls in enumerate((*classes, "mean")[: len(classes) ** 2]):
-                a, b = np.split(samples[..., index], [len(run_a)])
+                a, b = np.split(aps[..., index], [len(run_a)])
                 if not np.isnan(a[0, 0]):
                     values = _difference(a, b, is_paired, np.unique(of_frame).size)
-                    rows.append(Comparison(kind, condition, cls, *terms, *values))
+                    rows.append(Comparison(kind, condition, cls, *shown, *values))
     is_tested = min(len(run_a), len(run_b)) >= MIN_SEEDS
     adjusted, least = list[Comparison](), 0.0
-    for _, kind in itertools.groupby(rows, lambda row: row.kind):
-        group = list(kind)
+    for _, of_kind in itertools.groupby(rows, lambda row: row.kind):
+        group = list(of_kind)
         found = np.maximum(_holm([row.p_value for row in group]), least).tolist()
         least = least or min(found)  # of all frames, which are the first group
         for row, p in zip(group, found, strict=True):
             verdict = p < 1 - LEVEL if is_tested else None
-            adjusted.append(
-                dataclasses.replace(row, p_adjusted=p, is_significant=verdict)
-            )
+            row = dataclasses.replace(row, p_adjusted=p, is_significant=verdict)
+            adjusted.append(row)
     return adjusted
 
 
-def _difference(
-    a: Float[np.ndarray, "N B"],
-    b: Float[np.ndarray, "M B"],
-    is_paired: bool,
-    num_sequences: int,
-) -> tuple[Any, ...]:
+def _difference(a: Aps, b: Aps, is_paired: bool, num_sequences: int) -> tuple[Any, ...]:
     """Returns both APs, their difference, its deviation, interval and p-value.
 
     Args:
-        a: APs of the seeds of run A. The first column is over all frames, the others are
+        a: `[N, 1+B]` APs of the seeds of run A. The first column is over all frames, the others are
             over resamples of sequences.
-        b: APs of run B in the same way.
+        b: `[M, 1+B]` APs of run B in the same way.
         is_paired: Whether row i of both runs has the same seed.
         num_sequences: Number of sequences.
     """
@@ -234,14 +219,12 @@ def _check_same_truth(data_a: EvaluationSet, data_b: EvaluationSet) -> None:
     ):
         if not np.array_equal(one, other):
             counts = f"{len(one)} and {len(other)}"
-            raise UserError(
-                f"the runs have different {name} ({counts}), expected equal"
-            )
+            raise UserError(f"the runs have different {name} ({counts})")
 
 
 def comparison_tables(
     rows: Sequence[Comparison], run_a: str, run_b: str, seeds: Iterable[int] = ()
-) -> list[Table]:
+) -> list[report.Table]:
     """Returns the tables of differences over all frames, by weather and by distance.
 
     Args:
@@ -254,34 +237,27 @@ def comparison_tables(
     note = "over sequences; the variation between trainings is not counted"
     if is_tested:
         counts = " and ".join(map(str, dict.fromkeys(seeds)))
-        note = (
-            f"over seeds and sequences, gains ± standard deviation over {counts} seeds"
-        )
+        note = f"over seeds and sequences, gain ± standard deviation of {counts} seeds"
     title = f"B = {run_b} against A = {run_a}: p after Holm, 95 % intervals {note}"
-    header = ["Class", "Protocol", "AP", "IoU", "A", "B", "B - A", "95 %", "p"]
+    header = ["Class", "Protocol", "AP", "A", "B", "B - A", "95 %", "p"]
     header += ["Difference"] * is_tested
     built = []
     for kind, group in itertools.groupby(rows, lambda row: row.kind):
         body = []
         for row in group:
-            gap, low, high = numbers((row.difference, row.low, row.high), signed=True)
             protocol = f"{row.protocol}, score>{row.score_threshold:g}"
-            entries = [
-                row.condition,
-                row.cls,
-                protocol,
-                row.space.upper(),
-                f"{row.iou:g}",
-            ]
-            entries += [*numbers((row.ap_a, row.ap_b)), gap, f"[{low}, {high}]"]
-            entries.append(f"{row.p_adjusted:.3f}")
+            metric = f"{row.space.upper()} {row.iou:g}"
+            gap, low, high = report.numbers(
+                (row.difference, row.low, row.high), signed=True
+            )
+            verdict = []
             if is_tested:
-                entries[7] += f" ± {number(row.std)}"
-                entries.append(
-                    "significant" if row.is_significant else "not significant"
-                )
-            body.append(entries)
-        built.append(Table(title, [kind.capitalize(), *header], body))
+                gap += f" ± {report.number(row.std)}"
+                verdict = ["significant" if row.is_significant else "not significant"]
+            aps = report.numbers((row.ap_a, row.ap_b))
+            values = [*aps, gap, f"[{low}, {high}]", f"{row.p_adjusted:.3f}", *verdict]
+            body.append([row.condition, row.cls, protocol, metric, *values])
+        built.append(report.Table(title, [kind.capitalize(), *header], body))
     return built
 
 
@@ -313,7 +289,9 @@ def compare_files(
         raise UserError("--bootstrap=0: a comparison needs 1 resample or more")
     folders = [report_folders(path) for path in paths]
     # Predictions below the lowest stored score of one run must not count for another run.
-    stored = (stored_from(place) for run in folders for place in run.values())
+    stored = (
+        stored_options(x).get("min_score", 0) for y in folders for x in y.values()
+    )
     options = dataclasses.replace(options, min_score=max(options.min_score, *stored))
     names = [str(path) for path in paths]
     (first, frames), *others = [_load_run(run, source, options) for run in folders]
@@ -321,15 +299,15 @@ def compare_files(
     for name, (sets, _) in zip(names[1:], others, strict=True):
         found = compare(first, sets, frames, options)
         built += comparison_tables(found, names[0], name, (len(first), len(sets)))
-        rows += [plain(dataclasses.asdict(row)) for row in found]
+        rows += [report.plain(dataclasses.asdict(row)) for row in found]
     is_simulated = next(iter(first.values())).is_simulated
-    text = rendered(built, is_simulated=is_simulated)
+    text = report.rendered(built, is_simulated=is_simulated)
     if out_dir is not None:
         content = {"runs": names, "options": dataclasses.asdict(options), "rows": rows}
         place = pathlib.Path(out_dir) / "comparison"
         files.write_text(place.with_suffix(".txt"), text)
         files.write_json(place.with_suffix(".json"), content)
-        write_tables(place, built, is_simulated=is_simulated)
+        report.write_tables(place, built, is_simulated=is_simulated)
     return text, rows
 
 

@@ -27,6 +27,9 @@ MAX_PAIRS = 1_000_000
 
 A frame rarely has more than 100 predictions and 20 objects of a class."""
 
+Rows = Bool[np.ndarray, " _"] | slice
+ALL = slice(None)
+
 Matches = matching.KradarMatches | Int[np.ndarray, " M"]
 
 
@@ -185,29 +188,20 @@ class EvaluationSet:
         shape = self.frame.size, len(self.classes)
         return np.bincount(group, minlength=shape[0] * shape[1]).reshape(shape)
 
-    def evaluated(
-        self,
-        is_object: Bool[np.ndarray, " N"] | slice = slice(None),
-        is_found: Bool[np.ndarray, " M"] | slice = slice(None),
-    ) -> tuple[Boxes, Boxes]:
-        """Returns the objects and predictions of masks of `gt` and `pred` as given."""
-        rows = np.sort(self._gt_row[is_object]), np.sort(self._pred_row[is_found])
-        return self.ground_truth.take(rows[0]), self.predictions.take(rows[1])
+    def evaluated(self, gt: Rows = ALL, pred: Rows = ALL) -> tuple[Boxes, Boxes]:
+        """Returns rows of `gt` and `pred` as they were given, in the order of the input."""
+        truth, found = np.sort(self._gt_row[gt]), np.sort(self._pred_row[pred])
+        return self.ground_truth.take(truth), self.predictions.take(found)
 
     def of_frames(self, is_chosen: Bool[np.ndarray, " F"]) -> EvaluationSet:
         """Returns the evaluation set of some frames, such as those of one condition."""
         chosen = is_chosen[self.gt.frame], is_chosen[self.pred.frame]
         return self.of_boxes(*chosen, self.frame[is_chosen])
 
-    def of_boxes(
-        self,
-        is_object: Bool[np.ndarray, " N"],
-        is_found: Bool[np.ndarray, " M"],
-        frame: Int[np.ndarray, " K"],
-    ) -> EvaluationSet:
-        """Returns the evaluation set of masks of `gt` and `pred` in the given frames."""
+    def of_boxes(self, gt: Rows, pred: Rows, frame: np.ndarray) -> EvaluationSet:
+        """Returns the evaluation set of rows of `gt` and `pred` in the frames of these ids."""
         return EvaluationSet(
-            *self.evaluated(is_object, is_found),
+            *self.evaluated(gt, pred),
             classes=self.classes,
             frames={
                 "frame": frame,

@@ -30,7 +30,7 @@ from radejax.evaluation.boxes import (
 )
 from radejax.evaluation.kitti import read_kitti
 from radejax.evaluation.report import Report, write_report
-from radejax.evaluation.results import SAME_NUMBERS, EvaluationOptions
+from radejax.evaluation.results import EvaluationOptions
 
 LOW_SCORE = 0.1
 """If the lowest stored score is above this and the score threshold, a warning is given."""
@@ -247,7 +247,7 @@ def report_folders(path: PathLike) -> dict[str, pathlib.Path]:
 
 
 def stored_options(path: PathLike) -> dict[str, Any]:
-    """Returns the options of the first report of a run that change its numbers.
+    """Returns the options of the first report of a run.
 
     Without a report, they are the classes of the config in the folder or its parent, or
     none without a config.
@@ -258,16 +258,7 @@ def stored_options(path: PathLike) -> dict[str, Any]:
             found = {"classes": files.read_object(config, "classes")["classes"]}
     if (place / "metrics.json").is_file():
         found = files.read_object(place / "metrics.json", "options")["options"]
-    return {
-        name: tuple(value) if isinstance(value, list) else value
-        for name, value in found.items()
-        if name not in SAME_NUMBERS
-    }
-
-
-def stored_from(path: PathLike) -> float:
-    """Returns the minimum score of stored predictions in their report, or 0 without one."""
-    return float(stored_options(path).get("min_score", 0.0))
+    return {name: tuple(x) if isinstance(x, list) else x for name, x in found.items()}
 
 
 def _read_frames(path: PathLike) -> Columns:
@@ -299,7 +290,7 @@ def evaluate_files(
     if others:
         raise UserError(f"{path.parents[1]} holds several seeds: name one of them")
     truth, found, frames, left_out = load(path, source, options.classes)
-    warnings, low = [], stored_from(path)
+    warnings, low = [], stored_options(path).get("min_score", 0.0)
     if low > max(LOW_SCORE, options.score_threshold):
         warnings.append(
             f"{path} has only predictions from score {low:g} on, and every number is of "

@@ -142,10 +142,9 @@ def write_report(
         write_boxes(folder / "predictions.npz", data.predictions, frames)
         write_boxes(folder / "ground_truth.npz", data.ground_truth, frames)
         if options.kitti:
-            objects, found = (vars(boxes) for boxes in data.evaluated())
-            threshold = options.settings_of("kradar_r40")["score_threshold"]
-            place = folder / "kitti"
-            write_kitti(place, objects, found, frames, score_threshold=threshold)
+            truth, found = map(vars, data.evaluated())
+            least = options.settings_of("kradar_r40")["score_threshold"]
+            write_kitti(folder / "kitti", truth, found, frames, score_threshold=least)
         if options.plots:
             _draw_curves(data, frames, options, folder)
         if draw_frame is not None:

@@ -48,19 +48,7 @@ _RANGES = {
     "invalid_sizes": one_of("error", "false_positive"),
     "batch_size": integer(1),
     "num_visualizations": integer(0),
-    "figures": one_of("png", "pdf"),
 }
-
-
-SAME_NUMBERS = (
-    "bootstrap",
-    "plots",
-    "batch_size",
-    "num_visualizations",
-    "figures",
-    "kitti",
-)
-"""Fields of `EvaluationOptions` that do not change the APs."""
 
 
 @dataclasses.dataclass(frozen=True)

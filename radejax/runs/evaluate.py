@@ -24,7 +24,7 @@ from radejax.data.projection import decode
 from radejax.evaluation.boxes import Columns, roi_bounds, tables_from_frames
 from radejax.evaluation.evaluation_set import Result
 from radejax.evaluation.report import Report, write_report
-from radejax.evaluation.results import SAME_NUMBERS, EvaluationOptions, evaluate_tables
+from radejax.evaluation.results import EvaluationOptions, evaluate_tables
 from radejax.inference.detector import Detector, check_backbone
 from radejax.inference.predict import predict_dataset
 from radejax.inference.saved import PathLike, SavedModel, Step, load_model
@@ -241,6 +241,10 @@ class Evaluation:
             yield name, draw_frame(self._scene(predictions, index))
 
 
+_SAME_NUMBERS = ("bootstrap", "batch_size", "num_visualizations", "figures", "plots")
+"""Options of an evaluation that do not change its APs."""
+
+
 def named_aps(results: Sequence[Result]) -> dict[str, float]:
     """Return the APs over all frames by metric and class, and means by m and metric."""
     return {
@@ -301,7 +305,7 @@ def evaluate_run(
     name += "" if shuffle_images is None else "_shuffled"
     name += "" if step is None else f"_checkpoint_{step}"
     for field, value in changes.items():
-        if field not in SAME_NUMBERS and value != getattr(usual, field):
+        if field not in _SAME_NUMBERS and value != getattr(usual, field):
             values = value if isinstance(value, tuple) else (value,)
             name += "_".join(["", field, *(str(x).replace(" ", "-") for x in values)])
     run = run or workdir.name

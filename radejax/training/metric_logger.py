@@ -179,7 +179,8 @@ class MetricLogger:
 
 def log_results(folder: pathlib.Path, step: int, values: Mapping[str, float]) -> None:
     """Writes the APs of the report of a finished run to its TensorBoard folder."""
-    with tensorboardX.SummaryWriter(str(folder / "tensorboard")) as board:
+    place = str(folder / "tensorboard")
+    with tensorboardX.SummaryWriter(place, filename_suffix=".test") as board:
         for name, value in values.items():
             board.add_scalar(f"test/{name}", value, step)
 
