@@ -335,7 +335,7 @@ def test_folders_of_seeds_and_of_runs_are_compared(two_runs, tmp_path):
     done = CliRunner().invoke(main, ["compare", *map(str, two_runs), *words])
     assert done.exit_code == 0, done.output
     title = done.stdout.splitlines()[0]
-    assert "gains ± standard deviation over 3 seeds" in title
+    assert "gain ± standard deviation of 3 seeds" in title
     assert "over seeds and sequences" in title
     assert re.search(r"kradar_r40, score>0.4 .*\d ± \d", done.stdout)
     assert re.search(r"all_point, score>0.1 .* (not )?significant", done.stdout)

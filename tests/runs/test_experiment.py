@@ -108,7 +108,7 @@ def test_labels_are_read_once(
         folder = experiment.run(config, tmp_path / "run")
     assert evaluated == [[2, 2], [4, 4]]
     (events,) = (folder / "tensorboard").glob("*.test")
-    assert b"test/map_3d_iou30/coco101/score>0.05" in events.read_bytes()
+    assert b"test/map_3d_iou30/coco101/" in events.read_bytes()
     frames = json.loads((folder / "evaluation" / "frames.json").read_text())
     assert (frames["sequence"], frames["split"]) == ([4, 4], ["test", "test"])
     assert "Best checkpoint, chosen on the validation split: " in caplog.text
