@@ -238,7 +238,7 @@ def comparison_tables(
     if is_tested:
         counts = " and ".join(map(str, dict.fromkeys(seeds)))
         note = f"over seeds and sequences, gain ± standard deviation of {counts} seeds"
-    title = f"B = {run_b} against A = {run_a}: p after Holm, 95 % intervals {note}"
+    note = f"p after Holm, 95 % intervals {note}"
     header = ["Class", "Protocol", "AP", "A", "B", "B - A", "95 %", "p"]
     header += ["Difference"] * is_tested
     built = []
@@ -257,6 +257,8 @@ def comparison_tables(
             aps = report.numbers((row.ap_a, row.ap_b))
             values = [*aps, gap, f"[{low}, {high}]", f"{row.p_adjusted:.3f}", *verdict]
             body.append([row.condition, row.cls, protocol, metric, *values])
+        by = "all frames" if kind == "all" else f"by {kind}"
+        title = f"B = {run_b} against A = {run_a}, {by}: {note}"
         built.append(report.Table(title, [kind.capitalize(), *header], body))
     return built
 
