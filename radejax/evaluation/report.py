@@ -28,7 +28,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from tabulate import tabulate
+from tabulate import LATEX_ESCAPE_RULES, tabulate
 
 from radejax.core import files
 from radejax.core.files import PathLike
@@ -36,6 +36,7 @@ from radejax.data.kradar.conditions import WEATHERS
 from radejax.evaluation import analysis, protocols
 from radejax.evaluation.boxes import Columns, roi_name, write_boxes
 from radejax.evaluation.evaluation_set import EvaluationSet, Result
+from radejax.evaluation.kitti import write_kitti
 from radejax.evaluation.results import (
     EvaluationOptions,
     condition_masks,
@@ -98,7 +99,8 @@ def write_report(
         options = dataclasses.replace(options, protocols=names)
     data, results = evaluate_tables(ground_truth, predictions, frames, options)
     iou = options.iou_thresholds[0]
-    settings = f"3d, IoU {iou:g}, score > {analysis.OPERATING_SCORE:g}"
+    settings = f"3d, IoU {iou:g}, score>{options.min_score:g}; precision and recall "
+    settings += f"at score>{analysis.OPERATING_SCORE:g}"
     metrics = {
         "run": run,
         "options": dataclasses.asdict(options),
@@ -130,9 +132,10 @@ def write_report(
         files.write_json(folder / "metrics.json", metrics)
         files.write_json(folder / "frames.json", columns)
         files.write_text(folder / "report.txt", text)
-        for name, style in (("tables.md", "markdown"), ("tables.tex", "latex")):
-            content = rendered(built, style, is_simulated=data.is_simulated)
-            files.write_text(folder / name, content)
+        write_tables(folder / "tables", built, is_simulated=data.is_simulated)
+        for table in built:
+            latex = table.render("latex", is_simulated=data.is_simulated)
+            files.write_text(folder / "tables" / f"{table.label}.tex", latex)
         with open(folder / "metrics.csv", "w", encoding="utf-8", newline="") as file:
             writer = csv.DictWriter(file, list(metrics["ap"][0]), lineterminator="\n")
             writer.writeheader()
@@ -140,6 +143,10 @@ def write_report(
         # The stored predictions have repaired sizes, so that they can be evaluated again.
         write_boxes(folder / "predictions.npz", data.predictions, frames)
         write_boxes(folder / "ground_truth.npz", data.ground_truth, frames)
+        if options.kitti:
+            truth, found = map(vars, data.evaluated())
+            least = options.settings_of("kradar_r40")["score_threshold"]
+            write_kitti(folder / "kitti", truth, found, frames, score_threshold=least)
         if options.plots:
             _draw_curves(data, frames, options, folder)
         if draw_frame is not None:
@@ -148,7 +155,8 @@ def write_report(
                 name = f"frame_{entry['frame']}"
                 if {"name", "sequence"} <= set(entry):  # as in other figures
                     name = f"{entry['sequence']:02d}_{entry['name']}"
-                draw_frame(entry["frame"], folder / "worst_frames" / f"{name}.png")
+                path = folder / "worst_frames" / f"{name}.{options.figures}"
+                draw_frame(entry["frame"], path)
     return Report(text, metrics, results, pathlib.Path(out_dir))
 
 
@@ -234,8 +242,8 @@ def _draw_curves(
                 panels.setdefault(title, {})[label] = curve
         seen = {title: lines for title, lines in panels.items() if any(lines.values())}
         figure = draw_precision_recall(seen or dict([*panels.items()][:1]))
-        path = folder / f"precision_recall_{space}_iou{100 * iou:.4g}.png"
-        save_figure(figure, path)
+        name = f"precision_recall_{space}_iou{100 * iou:.4g}.{options.figures}"
+        save_figure(figure, folder / name)
 
 
 def plain(value: Any) -> Any:
@@ -275,15 +283,22 @@ class Table:
     header: Sequence[str]
     rows: Sequence[Sequence[str | int]]
 
+    @property
+    def label(self) -> str:
+        """Label in LaTeX and name of the file of the table."""
+        return re.sub("[^a-z0-9]+", "-", self.title.lower()).strip("-")
+
     def render(self, style: str = "text", *, is_simulated: bool = False) -> str:
-        """Renders the table as "text", "markdown" or "latex" (with the title as comment)."""
+        """Renders the table as "text", "markdown" or "latex" (with caption and label)."""
         align = ["left", *["right"] * (len(self.header) - 1)]
         body = tabulate(
             self.rows, self.header, STYLES[style], disable_numparse=True, colalign=align
         )
         title = f"Simulated data: {self.title}" if is_simulated else self.title
         if style == "latex":
-            return f"% {title}\n{body}\n"
+            caption = "".join(LATEX_ESCAPE_RULES.get(x, x) for x in title)
+            head = f"\\caption{{{caption}}}\n\\label{{tab:{self.label}}}\n"
+            return f"\\begin{{table}}\n{head}{body}\n\\end{{table}}\n"
         title = f"**{title}**" if style == "markdown" else title
         return f"{title}\n\n{body}\n"
 
@@ -293,6 +308,12 @@ def rendered(
 ) -> str:
     """Renders several tables below each other."""
     return "\n".join(table.render(style, is_simulated=is_simulated) for table in tables)
+
+
+def write_tables(path: pathlib.Path, tables: Sequence[Table], **options: Any) -> None:
+    """Writes tables as Markdown and LaTeX to files with these suffixes, see `rendered`."""
+    for suffix, style in ((".md", "markdown"), (".tex", "latex")):
+        files.write_text(path.with_suffix(suffix), rendered(tables, style, **options))
 
 
 def number(value: float | None, *, signed: bool = False, digits: int = 2) -> str:
@@ -349,7 +370,8 @@ def by_protocol(
     body = []
     for name in options.protocols:
         found = (results[name, "all", cls, space, iou] for cls in classes)
-        body.append([name, *map(_with_interval, found)])
+        terms = f"{name}, score>{options.settings_of(name)['score_threshold']:g}"
+        body.append([terms, *map(_with_interval, found)])
     title = f"AP {space.upper()} at IoU {iou:g} in every protocol, all weathers"
     if any(result.low is not None for result in results.values()):
         title += f", 95 % intervals of {options.bootstrap} resamples of sequences"

@@ -14,6 +14,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import numpy as np
+import optax
 from jax.extend.core import ClosedJaxpr
 from jax.interpreters import partial_eval
 from ml_collections import ConfigDict
@@ -95,8 +96,9 @@ def train(
             space is left on the disk.
     """
     options, folder = config.train, files.as_path(workdir)
+    schedule = make_schedule(options, steps_per_epoch)
     optimizer = make_optimizer(
-        make_schedule(options, steps_per_epoch),
+        schedule,
         weight_decay=options.weight_decay,
         gradient_clip_norm=options.gradient_clip_norm,
         gradient_accumulation_steps=options.gradient_accumulation_steps,
@@ -127,7 +129,7 @@ def train(
         ):
             run = _Run(
                 *(config, steps_per_epoch, num_steps, loader, info, evaluate),
-                *(checkpoints, logger, stop),
+                *(checkpoints, logger, stop, schedule),
             )
             return run.take_steps(train_step, state, profile)
 
@@ -155,6 +157,7 @@ class _Run:
     checkpoints: Checkpoints
     logger: MetricLogger
     stop: Callable[[], bool]
+    schedule: optax.Schedule
     num_skipped: int = 0  # steps that were skipped and reported so far
 
     def take_steps(
@@ -186,7 +189,8 @@ class _Run:
         self.logger.advance(step, metrics)
         is_logged = self._is_due(step, train.log_every_steps)
         if is_logged:
-            self.logger.log(step, metrics, epoch=step / self.steps_per_epoch)
+            rate = {"learning_rate": self.schedule(step - 1)}
+            self.logger.log(step, metrics | rate, epoch=step / self.steps_per_epoch)
         scores = None
         every = self.steps_per_epoch * train.evaluate_every_epochs
         if self.evaluate is not None and self._is_due(step, every):

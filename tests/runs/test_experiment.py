@@ -107,6 +107,8 @@ def test_labels_are_read_once(
         config.data.roots = (str(tmp_path / "data"),)
         folder = experiment.run(config, tmp_path / "run")
     assert evaluated == [[2, 2], [4, 4]]
+    (events,) = (folder / "tensorboard").glob("*.test")
+    assert b"test/map_3d_iou30/coco101/" in events.read_bytes()
     frames = json.loads((folder / "evaluation" / "frames.json").read_text())
     assert (frames["sequence"], frames["split"]) == ([4, 4], ["test", "test"])
     assert "Best checkpoint, chosen on the validation split: " in caplog.text
@@ -179,10 +181,10 @@ def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
         seen.append((config.seed, workdir.name, init_from))
         (workdir / "evaluation").mkdir(parents=True)
         (workdir / "evaluation" / "metrics.csv").write_text(
-            "protocol,condition,cls,space,iou,ap,num_gt\n"
-            + f"all_point,all,Sedan,3d,0.3,{aps[config.seed]},10\n"
-            + "all_point,all,Bicycle,3d,0.3,,0\n"
-            + f"all_point,rain,Sedan,3d,0.3,{config.seed},3\n"
+            "name,protocol,score_threshold,condition,cls,space,iou,ap,num_gt\n"
+            + f"a/simulated,all_point,0.05,all,Sedan,3d,0.3,{aps[config.seed]},10\n"
+            + "b/simulated,all_point,0.05,all,Bicycle,3d,0.3,,0\n"
+            + f"c/simulated,all_point,0.05,rain,Sedan,3d,0.3,{config.seed},3\n"
         )
         return workdir
 
@@ -196,8 +198,11 @@ def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
     assert rows[0]["std"] == pytest.approx(21**0.5)  # (16 + 1 + 25) / 2
     assert rows[0]["values"] == {"0": 50.0, "1": 53.0, "2": 59.0}
     text = (tmp_path / "runs" / "seeds.txt").read_text()
-    assert "54.00" in text
-    assert "4.58" in text
+    assert text.startswith("Simulated data: AP, mean ± standard deviation over 3 seeds")
+    for ending in ("txt", "md", "tex"):
+        table = (tmp_path / "runs" / f"seeds.{ending}").read_text()
+        assert "54.00 ± 4.58" in table
+    assert "all_point, score>0.05" in text
     assert "rain" not in text
 
 

@@ -21,6 +21,7 @@ from radejax.core.errors import DataError, UserError
 from radejax.training import distributed, loop
 from radejax.training.checkpoints import Checkpoints
 from radejax.training.metric_logger import Scores
+from radejax.training.step import make_schedule
 
 Tiny = Any  # the fixture `tiny` of conftest.py
 STEPS_PER_EPOCH = 4
@@ -353,8 +354,13 @@ def test_evaluation_on_the_way_is_logged_and_the_best_kept(
 
     run(workdir, config=config, evaluate=evaluate, steps_per_epoch=2)
     rows = map(json.loads, (workdir / "metrics.jsonl").read_text().splitlines())
+    rows = list(rows)
     name = "validation/ap_bev_iou30/exact"
     assert [row[name] for row in rows if name in row] == [1.5, 3.5, 2.5, 2.0]
+    schedule = make_schedule(config.train, 2)
+    rates = {row["step"]: row["learning_rate"] for row in rows if "focal" in row}
+    assert rates == {step: pytest.approx(float(schedule(step - 1))) for step in rates}
+    assert len(set(rates.values())) > 1
     with Checkpoints(workdir / "checkpoints", read_only=True) as checkpoints:
         assert checkpoints.steps() == [4, 8]
         assert checkpoints.best_step() == 4
