@@ -110,7 +110,12 @@ def export(
     folder = files.as_path(folder)
     programs: dict[str, bytes] = {}
     grid, is_tensor = detector.grid, radar_input == "tensor"
-    shape = grid.shape_drea if is_tensor else grid.projection_shape
+    if is_tensor and detector.num_frames > 1:
+        raise UserError(
+            f"--input tensor takes one frame, the model {detector.num_frames} "
+            "(config.data.num_frames): export it with --input projection"
+        )
+    shape = grid.shape_drea if is_tensor else _input_shape(detector)
     if kind == "stablehlo":
         programs = _stablehlo(detector, shape, platforms, batch_size, with_backbone)
     elif kind == "onnx":
@@ -136,10 +141,21 @@ def export(
     }
 
 
+def _input_shape(detector: Detector) -> tuple[int, int, int]:
+    """Return range, azimuth and channels of the projections that the network takes."""
+    range_, azimuth, channels = detector.grid.projection_shape
+    return range_, azimuth, detector.num_frames * channels
+
+
 def _readme(detector: Detector, is_tensor: bool, left_out: Sequence[str]) -> str:
     """Return the text of the model card."""
     grid = detector.grid
-    radar = f"Projections [B, {', '.join(map(str, grid.projection_shape))}] float32"
+    radar = f"Projections [B, {', '.join(map(str, _input_shape(detector)))}] float32"
+    if detector.num_frames > 1:
+        radar += (
+            f" of {detector.num_frames} consecutive frames, oldest first: the Doppler "
+            "channels of all, then their elevation channels"
+        )
     if is_tensor:
         radar = f"Power [B, {', '.join(map(str, grid.shape_drea))}] float32 of radar tensors"
     config = detector.saved.config

@@ -81,12 +81,16 @@ def run(
     checks.check(config)
     config, folder = located(config), files.as_path(workdir).absolute()
     distributed.check_batch_size(config.train.batch_size)
-    model, digest = models.build(config.model), None
+    model, digest = models.build(config.model, config.data.num_frames), None
     if config.data.embeddings is not None:
         embeddings = open_embeddings(config.data.embeddings)
         digest = embeddings.source["weights_sha256"]
     weights = starting_weights(
-        config.model, init_from, config.data.image_backbone, digest
+        config.model,
+        init_from,
+        config.data.image_backbone,
+        digest,
+        num_frames=config.data.num_frames,
     )
     with claimed(folder, config):
         data = open_data(config, model)

@@ -346,7 +346,7 @@ def test_table_by_hand(written):
         frame_of("1/c", [BOX], ["Pedestrian"]),
     ]
     table = make_table(written, frames, max_objects=2, classes=("Sedan", "Bicycle"))
-    assert table.keys == ("1/b", "1/a", "1/c")
+    assert table.keys == (("1/b",), ("1/a",), ("1/c",))
     assert table.classes.tolist() == [[1, 0], [-1, -1], [-1, -1]]
     wanted = [10.0, -2.0, 0.5, 4.0, 2.0, 1.5, 0.5, np.sqrt(3) / 2]
     np.testing.assert_allclose(table.boxes[0, 1], wanted, rtol=1e-6)
