@@ -501,10 +501,8 @@ def radar_batch(
         f"[{axes}, {', '.join(map(str, tesseract))}]"
     )
     if steps:
-        text += (
-            f": {num_frames} consecutive frames (config.data.num_frames), oldest first. "
-            "Detector.stream takes single frames and keeps the preceding ones"
-        )
+        text += f" of {num_frames} consecutive frames (config.data.num_frames), oldest "
+        text += "first; Detector.stream takes single frames and keeps preceding ones"
     raise UserError(text)
 
 

@@ -78,8 +78,7 @@ class SavedModel:
     def model(self) -> nn.Module:
         """The Flax module, without parameters."""
         # Runs of earlier versions have no `num_frames`.
-        num_frames = self.config.data.get("num_frames", 1)
-        return models.build(self.config.model, num_frames)
+        return models.build(self.config.model, self.config.data.get("num_frames", 1))
 
 
 def load_model(
@@ -295,8 +294,7 @@ def _with_backbone(saved: SavedModel, given: PathLike | None) -> SavedModel:
     if given is not None or (source and files.as_path(source).exists()):
         part = image_backbone.load_image_backbone(source, saved.model)
     elif start and files.as_path(start).exists() and not data.embeddings:
-        source = start
-        part = _fitting_variables(start, saved.config.model, saved.model)
+        source, part = start, _fitting_variables(start, saved.config.model)
     if IMAGE_BACKBONE not in part["params"]:
         if source is not None:
             _log.warning(
@@ -335,7 +333,6 @@ def starting_weights(
     init_from: PathLike | None = None,
     image_backbone_path: PathLike | None = None,
     embeddings_sha256: str | None = None,
-    num_frames: int = 1,
 ) -> StartingWeights:
     """Read the weights that a training starts from, including frozen ones.
 
@@ -347,15 +344,14 @@ def starting_weights(
             `image_backbone.load_image_backbone`.
         embeddings_sha256: Checksum of the weights with which `radejax embed` computed the
             embeddings that replace the frozen backbone; None without embeddings.
-        num_frames: `config.data.num_frames`.
 
     Raises:
         UserError: The weights do not fit the model; the message names the differences.
     """
-    model: Any = models.build(config, num_frames)
+    model: Any = models.build(config)
     variables = pretrained = digest = None
     if init_from is not None:
-        variables = _fitting_variables(init_from, config, model)
+        variables = _fitting_variables(init_from, config)
     if variables is None or IMAGE_BACKBONE not in variables["params"]:
         pretrained = image_backbone.load_image_backbone(
             image_backbone_path, model, embeddings_sha256
@@ -368,24 +364,16 @@ def starting_weights(
     return StartingWeights(variables, pretrained, digest)
 
 
-def _fitting_variables(path: PathLike, config: Any, model: Any) -> Mapping[str, Any]:
-    """Read the weights of another run or an official file, which must fit a model.
-
-    Args:
-        path: Path of the weights.
-        config: The section `config.model`.
-        model: The model that it describes.
-    """
+def _fitting_variables(path: PathLike, config: Any) -> Mapping[str, Any]:
+    """Read the weights of another run or an official file, which must fit `config.model`."""
     wanted = json.loads(config.to_json())
     if files.as_path(path).is_dir():
         other = load_model(path)
         found = json.loads(other.config.model.to_json())
         if lines := files.differences(found, wanted, "config.model"):
             raise UserError(f"weights of {path} do not fit: {'; '.join(lines)}")
-        variables = other.variables
-    else:
-        structure = {name: value for name, value in wanted.items() if name != "name"}
-        fields = {} if "image" in config else structure
-        variables = load_torch(path, **fields).variables
-    image_backbone.check_fits(model, variables, path)
+        return other.variables
+    structure = {name: value for name, value in wanted.items() if name != "name"}
+    variables = load_torch(path, **({} if "image" in config else structure)).variables
+    image_backbone.check_fits(models.build(config), variables, path)
     return variables

@@ -219,15 +219,12 @@ class Data:
             max_objects=options.max_objects,
             classes=self.classes,
             images=images,
-            num_frames=self._model.num_frames,
+            num_frames=options.num_frames,
         )
-        if self._model.num_frames > 1 and all(len(set(k)) == 1 for k in table.keys):
-            raise UserError(
-                f"config.data.num_frames is {self._model.num_frames}, but no frame of "
-                f"{', '.join(options.roots)} has a preceding one, as no two numbers of a "
-                "sequence are consecutive; set it to 1, or add these frames (in simulated "
-                "data: config.simulation.frames_per_sequence, frame_stride=1)"
-            )
+        count = options.num_frames
+        is_useful = count == 1 or any(len(set(keys)) > 1 for keys in table.keys)
+        expected = "1, as no two frames of a sequence have consecutive numbers"
+        require(is_useful, "config.data.num_frames", count, expected)
         if (shuffled := options.label_permutation_seed) is not None:
             order = np.random.default_rng(shuffled).permutation(len(table))
             boxes, classes = table.boxes[order], table.classes[order]

@@ -48,6 +48,7 @@ from radejax.runs import checks
 from radejax.runs.data import located, open_data
 from radejax.runs.evaluate import Evaluation
 from radejax.training import distributed, loop
+from radejax.weights.image_backbone import check_fits
 
 _log = logging.getLogger(__name__)
 
@@ -86,12 +87,10 @@ def run(
         embeddings = open_embeddings(config.data.embeddings)
         digest = embeddings.source["weights_sha256"]
     weights = starting_weights(
-        config.model,
-        init_from,
-        config.data.image_backbone,
-        digest,
-        num_frames=config.data.num_frames,
+        config.model, init_from, config.data.image_backbone, digest
     )
+    if weights.variables is not None:
+        check_fits(model, weights.variables, str(init_from))
     with claimed(folder, config):
         data = open_data(config, model)
         frames, grid = data.split("train"), data.records.grid
