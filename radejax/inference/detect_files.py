@@ -200,8 +200,7 @@ def detect_files(
         names = [f"preds/{number:06d}.txt" for number in range(len(keys))]
         table = {"frame": list(range(len(keys))), "name": keys}
         files.write_json(out / "frames.json", table)
-    parts = _consecutive(keys, detector.num_frames)
-    batches = [_batches(part, batch_size) for part in parts]
+    batches = _batches(keys, detector.num_frames, batch_size)
     is_table, rows = file_format in ("csv", "parquet"), list[dict[str, Any]]()
     streams = (detector.stream(map(inputs, part), **settings) for part in batches)
     found = itertools.chain.from_iterable(streams)
@@ -220,26 +219,27 @@ def detect_files(
     if is_table:
         _write_table(out / f"boxes.{file_format}", rows)
     if detector.num_frames > 1:
-        count["repeated"] = len(parts)
+        count["repeated"] = len(batches)
     if detector.takes_camera:
         count["radar_only"] = detector.num_radar_only
     return count
 
 
-def _consecutive(keys: Sequence[str], num_frames: int) -> list[range]:
-    """Return the positions of consecutive frames; of all frames if samples have one."""
+def _batches(
+    keys: Sequence[str], num_frames: int, batch_size: int
+) -> list[list[slice]]:
+    """Return the batches of every part of consecutive frames, which is one stream.
+
+    All frames are one part if a sample has one frame.
+    """
     starts = [0]
     if num_frames > 1:
-        before = {key: sample[-2] for key, sample in frame_histories(keys, 2).items()}
+        before = {key: sample[0] for key, sample in frame_histories(keys, 2).items()}
         pairs = itertools.pairwise(keys)
         starts += [i for i, (a, b) in enumerate(pairs, 1) if before[b] != a]
-    return list(map(range, starts, [*starts[1:], len(keys)]))
-
-
-def _batches(part: range, batch_size: int) -> list[slice]:
     return [
-        slice(i, min(i + batch_size, part.stop))
-        for i in range(part.start, part.stop, batch_size)
+        [slice(i, min(i + batch_size, end)) for i in range(start, end, batch_size)]
+        for start, end in itertools.pairwise([*starts, len(keys)])
     ]
 
 
