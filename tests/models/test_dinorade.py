@@ -85,7 +85,8 @@ def test_radar_parts_have_the_names_of_radenet():
 def test_elevation_weights_are_those_of_the_last_frame():
     detector = small_models.detector("camera", num_frames=2)
     model, variables = detector.model, detector.variables
-    image, camera = small_models.images(1), stack_cameras([calibration().camera()])
+    image = jnp.asarray(small_models.images(1))
+    camera = stack_cameras([calibration().camera()])
 
     @jax.jit
     def apply(stacked):
