@@ -235,17 +235,17 @@ def sample_keys(
     """Returns the keys of the records of every sample, oldest first.
 
     A preceding frame may be any frame that has a record, such as one of another split.
-    The number of samples with repeated frames is logged.
+    The number of samples that repeat a frame is logged.
     """
     if num_frames == 1:
         return tuple((frame.key,) for frame in frames)
     histories = frame_histories(records.keys(), num_frames)
     keys = tuple(histories[frame.key] for frame in frames)
     _log.info(
-        "%d of %d frames do not have %d preceding frames: the first one there is repeated",
+        "%d of %d samples of %d frames repeat one, as a preceding frame is missing",
         sum(len(set(sample)) < num_frames for sample in keys),
         len(keys),
-        num_frames - 1,
+        num_frames,
     )
     return keys
 

@@ -223,7 +223,7 @@ class Data:
         )
         count = options.num_frames
         is_useful = count == 1 or any(len(set(keys)) > 1 for keys in table.keys)
-        expected = "1, as no two frames of a sequence have consecutive numbers"
+        expected = "1, as no frame to train on has the preceding one of its sequence"
         require(is_useful, "config.data.num_frames", count, expected)
         if (shuffled := options.label_permutation_seed) is not None:
             order = np.random.default_rng(shuffled).permutation(len(table))

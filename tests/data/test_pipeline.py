@@ -247,7 +247,7 @@ def test_samples_are_the_records_of_a_frame_and_the_preceding_ones(
             wanted = channels[:, ::-1] if probability else channels
             np.testing.assert_array_equal(sample, wanted)
     assert seen == len(test) < len(every)
-    text = f"{repeated} of {seen} frames do not have 1 preceding frames"
+    text = f"{repeated} of {seen} samples of 2 frames repeat one"
     assert text in caplog.text
     train = {frame.key for frame in KRadar(kradar_root, split="train")}
     assert any(before in train for before, _ in table.keys)
