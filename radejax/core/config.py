@@ -297,6 +297,9 @@ _FIELDS: dict[str, Any] = {
         "validation": (),
         # Seed with which a fraction is drawn; independent of `seed`.
         "validation_seed": 0,
+        # Frames of a sample: the frame and those that precede it in its sequence, whose
+        # channels are concatenated; at least 1.
+        "num_frames": 1,
         # Number of objects to which each frame is padded; K-Radar v2.1 has at most 14.
         "max_objects": 32,
         # Mapping of azimuth bins to angles: true, or stretched for official checkpoints.

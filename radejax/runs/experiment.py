@@ -49,6 +49,7 @@ from radejax.runs.data import located, open_data
 from radejax.runs.evaluate import Evaluation, named_aps
 from radejax.training import distributed, loop
 from radejax.training.metric_logger import log_results
+from radejax.weights.image_backbone import check_fits
 
 _log = logging.getLogger(__name__)
 
@@ -82,13 +83,15 @@ def run(
     checks.check(config)
     config, folder = located(config), files.as_path(workdir).absolute()
     distributed.check_batch_size(config.train.batch_size)
-    model, digest = models.build(config.model), None
+    model, digest = models.build(config.model, config.data.num_frames), None
     if config.data.embeddings is not None:
         embeddings = open_embeddings(config.data.embeddings)
         digest = embeddings.source["weights_sha256"]
     weights = starting_weights(
         config.model, init_from, config.data.image_backbone, digest
     )
+    if weights.variables is not None:
+        check_fits(model, weights.variables, str(init_from))
     with claimed(folder, config):
         data = open_data(config, model)
         frames, grid = data.split("train"), data.records.grid

@@ -12,7 +12,8 @@ from radejax.core.config import base_config, load_config
 from radejax.core.errors import UserError
 from radejax.data.kradar import dataset
 from radejax.detection.decode import DecodeOptions
-from radejax.inference.saved import StartingWeights
+from radejax.inference.detect_files import detect_files
+from radejax.inference.saved import StartingWeights, load_model
 from radejax.runs import evaluate, experiment
 from radejax.runs.experiment import claimed
 from radejax.simulation.dataset import default_config, simulate_dataset
@@ -117,6 +118,40 @@ def test_labels_are_read_once(
         assert info["same"]["frames to train on"] == 4
     assert len(parsed) == 8
     assert set(parsed.values()) == {1}
+
+
+@pytest.mark.usefixtures("one_device")
+def test_a_run_of_two_frames(
+    tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Training, evaluation and detection; weights fit models of two frames only."""
+    config = load_config(f"{CONFIGS / 'quickstart.py'}:short")
+    config.simulation.update(
+        train_sequences=2, frames_per_sequence=3, output="projection"
+    )
+    config = small.shrink_run(config)
+    config.data.update(num_frames=2, roots=(str(tmp_path / "data"),))
+    config.model.update(cbam="off", widths=(8,), input_stem=True)
+    config.train.num_epochs = 1
+    config.evaluation.num_visualizations = 0
+    with caplog.at_level("INFO", "radejax"):
+        folder = experiment.run(config, tmp_path / "run")
+    assert "2 of 6 samples of 2 frames repeat one" in caplog.text
+    assert "1 of 3 samples of 2 frames repeat one" in caplog.text
+    saved = load_model(folder)
+    kernel = saved.variables["params"]["backbone"]["stem"]["doppler"]["conv"]["kernel"]
+    assert kernel.shape[-2] == 2 * 4
+    assert len(list((tmp_path / "data" / "records").glob("*/*.npy"))) == 9
+    root, out = tmp_path / "data", tmp_path / "boxes"
+    count = detect_files(folder, [root], out, score_threshold=0.0)
+    assert (count["frames"], count["repeated"]) == (9, 3)
+    config.data.num_frames = 1
+    with pytest.raises(UserError, match=r"run do not fit config.model .*stem/doppler"):
+        experiment.run(config, tmp_path / "one", init_from=folder)
+    config.data.update(num_frames=2, roots=(str(tmp_path / "single"),))
+    config.simulation.update(train_sequences=4, frames_per_sequence=1)
+    with pytest.raises(UserError, match=r"num_frames is 2, expected 1, as no frame to"):
+        experiment.run(config, tmp_path / "single_run")
 
 
 # Work folders ------------------------------------------------------------------------
