@@ -1,12 +1,22 @@
-"""Conversion of DINOv3 weights between Hugging Face's format and Flax, without torch.
+"""Conversion of DINOv3 and DINOv2 weights to Flax, without torch.
 
-The weights are gated and their license restricts redistribution: every user must download
-them, and published checkpoints must not contain them.
+| model | from | path |
+|---|---|---|
+| DINOv3 | Hugging Face transformers | folder with `config.json` and `model.safetensors` |
+| DINOv3 | timm | such a folder, or `model.safetensors` |
+| DINOv3 | Meta | `.pth` file |
+| DINOv2, with and without registers | Hugging Face transformers | folder |
+
+DINOv3 is also written, in the format of Hugging Face. Its weights are gated and their license
+restricts redistribution: every user must download them, and published checkpoints must not
+contain them. DINOv2's license is Apache-2.0.
 """
 
 from __future__ import annotations
 
 import contextlib
+import pathlib
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -17,10 +27,17 @@ import safetensors.numpy
 
 from radejax.core import files
 from radejax.core.archives import read_safetensors
-from radejax.core.errors import DataError, UserError, require
+from radejax.core.errors import SIZE, DataError, UserError, check_options, require
 from radejax.core.files import PathLike
 from radejax.models.vit import ViT
-from radejax.weights.convert import Rules, from_torch, shapes_of, to_numpy, to_torch
+from radejax.weights.convert import (
+    Rules,
+    from_torch,
+    read_state_dict,
+    shapes_of,
+    to_numpy,
+    to_torch,
+)
 
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
@@ -36,9 +53,11 @@ _FIELDS = {
 }
 """Attributes of `ViT` by the name of the corresponding field of Hugging Face's config."""
 
+_DINOV2_SIZES = ("hidden_size", "mlp_ratio", "image_size", "patch_size")
+
 
 def _constants(gated_mlp: bool) -> dict[str, Any]:
-    """Return the fields of Hugging Face's config for which only one value is supported."""
+    """Return the fields of DINOv3's config for which only one value is supported."""
     return {
         "model_type": "dinov3_vit",
         "rope_theta": 100.0,
@@ -53,9 +72,17 @@ def _constants(gated_mlp: bool) -> dict[str, Any]:
     }
 
 
+_DINOV2_CONSTANTS = {"layer_norm_eps": 1e-6, "qkv_bias": True, "hidden_act": "gelu"}
+"""The same for DINOv2. Its SwiGLU has SiLU for any `hidden_act`."""
+
+
+# Names -------------------------------------------------------------------------------
+
 _CLASS, _REGISTERS = "embeddings.cls_token", "embeddings.register_tokens"
+_POSITIONS, _PERIODS = "embeddings.position_embeddings", "rope_embed.periods"
 _RULES: Rules = (
     (r"^prefix_tokens", _CLASS),
+    (r"^position_embedding", _POSITIONS),
     (r"^patch_embed/", "embeddings.patch_embeddings."),
     (r"^norm/", "norm."),
     (r"^layers/norm_(\d)/", r"layer.{}.norm\1."),
@@ -66,14 +93,75 @@ _RULES: Rules = (
     ),
     (r"^layers/(up|gate|down)/", r"layer.{}.mlp.\1_proj."),
 )
-"""Rules from modules of `ViT` to Hugging Face's names, for `convert`."""
+"""Rules from modules of `ViT` to DINOv3's names in Hugging Face, for `convert`.
+
+The rules below lead from other names to these. A name with `(q|k|v)` stands for several
+tensors, into which the tensor is split along its first axis.
+"""
+
+_META_AND_TIMM: Rules = (
+    (r"^cls_token$", _CLASS),
+    (r"^(storage_tokens|reg_token)$", _REGISTERS),
+    (r"^mask_token$", "embeddings.mask_token"),
+    (r"^patch_embed\.proj\.", "embeddings.patch_embeddings."),
+    (r"^blocks\.", "layer."),
+    (r"\.attn\.qkv\.", ".attention.(q|k|v)_proj."),
+    (r"\.attn\.([qv])_bias$", r".attention.\1_proj.bias"),  # timm
+    (r"\.attn\.proj\.", ".attention.o_proj."),
+    (r"\.ls(\d)\.gamma$", r".layer_scale\1.lambda1"),
+    (r"\.gamma_(\d)$", r".layer_scale\1.lambda1"),
+    (r"\.(fc1|w2|fc1_x)\.", ".up_proj."),
+    (r"\.(w1|fc1_g)\.", ".gate_proj."),
+    (r"\.(fc2|w3)\.", ".down_proj."),
+)
+_DINOV2: Rules = (  # in Hugging Face, where transformers 5 adds "model." to some names
+    (r"^(model|encoder)\.", ""),
+    (r"^layernorm\.", "norm."),
+    (r"\.patch_embeddings\.projection\.", ".patch_embeddings."),
+    (r"\.attention\.attention\.([qkv])\w+\.", r".attention.\1_proj."),
+    (r"\.attention\.output\.dense\.", ".attention.o_proj."),
+    (r"\.weights_in\.", ".(gate|up)_proj."),
+    (r"\.weights_out\.", ".down_proj."),
+)
+
+
+def to_hugging_face(tensors: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the tensors of any source under DINOv3's names in Hugging Face."""
+    tensors = dict(tensors)
+    if "blocks.0.gamma_1" in tensors and "blocks.0.attn.q_bias" not in tensors:
+        # Most of timm's models are without the biases, because they are zero.
+        for name in [n for n in tensors if n.endswith(".attn.qkv.weight")]:
+            zeros = np.zeros(np.shape(tensors[name])[-1:], np.float32)
+            for part in "qv":
+                tensors[name.replace("qkv.weight", f"{part}_bias")] = zeros
+    renamed = {}
+    for name, value in tensors.items():
+        if name.endswith(".qkv.bias_mask"):
+            continue
+        mask = tensors.get(f"{name}_mask")
+        if np.shape(mask) == np.shape(value):
+            value = to_numpy(value) * to_numpy(mask)
+        for pattern, replacement in (*_DINOV2, *_META_AND_TIMM):
+            name = re.sub(pattern, replacement, name)
+        start, *parts = re.split(r"[()]", name)
+        if not parts:
+            renamed[name] = value
+            continue
+        fused, names = np.atleast_1d(to_numpy(value)), parts[0].split("|")
+        for part, own in zip(names, np.array_split(fused, len(names)), strict=True):
+            renamed[f"{start}{part}{parts[1]}"] = own
+    return renamed
+
+
+# Files -------------------------------------------------------------------------------
 
 
 def load(folder: PathLike) -> tuple[ViT, dict[str, Any]]:
-    """Load model and variables from a folder with `config.json` and `model.safetensors`.
+    """Load model and variables from a download.
 
     Args:
-        folder: Folder such as a download of `facebook/dinov3-vits16-pretrain-lvd1689m`.
+        folder: Folder such as a download of `facebook/dinov3-vits16-pretrain-lvd1689m` or
+            `facebook/dinov2-small`, or a file of Meta or timm; see the module.
 
     Returns:
         The model, and `{"params": ...}` with float32 arrays. For normalized images, the model
@@ -82,10 +170,20 @@ def load(folder: PathLike) -> tuple[ViT, dict[str, Any]]:
     Raises:
         FileNotFoundError: The folder or one of its files is missing.
         DataError: A file is corrupted, or tensors are missing, unexpected or of another
-            shape. The message lists up to 20 of them.
+            shape. The message lists up to 20 of them, with DINOv3's names in Hugging Face.
         UserError: The folder contains another kind of model.
     """
     folder = files.as_path(folder)
+    if folder.is_file():
+        tensors, source = read_state_dict(folder, "blocks.0.")
+        model = model_from_tensors(tensors, source)
+    else:
+        model, tensors, source = _read_folder(folder)
+    return model, {"params": to_params(model, tensors, source)}
+
+
+def _read_folder(folder: pathlib.Path) -> tuple[ViT, dict[str, Any], str]:
+    """Return the model, the tensors and the name of their file."""
     path = folder / WEIGHTS_FILE
     if path.with_name(f"{WEIGHTS_FILE}.index.json").is_file():
         raise UserError(
@@ -95,22 +193,19 @@ def load(folder: PathLike) -> tuple[ViT, dict[str, Any]]:
     missing = [n for n in (CONFIG_FILE, WEIGHTS_FILE) if not (folder / n).is_file()]
     if missing:
         raise FileNotFoundError(
-            f"{folder} lacks {' and '.join(missing)}: expected a DINOv3 model folder"
-            " as downloaded from Hugging Face"
+            f"{folder} lacks {' and '.join(missing)}: expected a DINOv3 or DINOv2 model "
+            "folder as downloaded from Hugging Face"
         )
     config = files.read_object(folder / CONFIG_FILE)
     tensors = read_safetensors(path)
-    if any(name.startswith("blocks.") for name in tensors):
-        raise UserError(
-            f"{path} has the names of timm or of Meta's code (blocks.0...), expected those "
-            "of transformers (layer.0...): download the model by facebook, such as "
-            "facebook/dinov3-vits16-pretrain-lvd1689m"
-        )
     try:
-        model = model_from_config(config)
+        if timm := config.get("architecture"):
+            is_known = re.match(r"vit_\w+_dinov3", str(timm)) is not None
+            require(is_known, "architecture", timm, "a vit_*_dinov3 of timm")
+            return model_from_tensors(tensors, str(path)), tensors, str(path)
+        return model_from_config(config), tensors, str(path)
     except UserError as error:
         raise UserError(f"{folder / CONFIG_FILE}: {error}") from None
-    return model, {"params": to_params(model, tensors, str(path))}
 
 
 def save(model: ViT, params: Mapping[str, Any], folder: PathLike) -> None:
@@ -121,6 +216,7 @@ def save(model: ViT, params: Mapping[str, Any], folder: PathLike) -> None:
         params: Parameters of the model, such as `load(folder)[1]["params"]`.
         folder: Folder, which is created if necessary. Existing files are replaced.
     """
+    require(not model.position_grid, "position_grid", model.position_grid, "0, DINOv3")
     folder = files.as_path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     config = {theirs: getattr(model, ours) for theirs, ours in _FIELDS.items()}
@@ -136,15 +232,33 @@ def model_from_config(config: Mapping[str, Any]) -> ViT:
     """Create the model that a Hugging Face `config.json` describes.
 
     Raises:
-        UserError: It does not describe a DINOv3 ViT, or a field is missing, of a wrong type,
-            out of range or not supported.
+        UserError: It does not describe a ViT of DINOv3 or DINOv2, or a field is missing, of
+            a wrong type, out of range or not supported.
     """
-    constants = _constants(config.get("use_gated_mlp") is True)
+    kind = config.get("model_type")
+    kinds = ("dinov3_vit", "dinov2", "dinov2_with_registers")
+    require(kind in kinds, "model_type", kind, f"one of {', '.join(kinds)}")
+    constants, position_grid = _constants(config.get("use_gated_mlp") is True), 0
+    if kind != "dinov3_vit":
+        config, constants = _as_dinov3(config), _DINOV2_CONSTANTS
+        position_grid = config["image_size"] // config["patch_size"]
     for name, value in constants.items():
         require(config.get(name) == value, name, config.get(name), f"{value!r}")
     if missing := sorted(set(_FIELDS) - set(config)):
-        raise UserError(f"DINOv3 config lacks {', '.join(missing)}")
-    return ViT(**{ours: config[theirs] for theirs, ours in _FIELDS.items()})
+        raise UserError(f"config of {kind} lacks {', '.join(missing)}")
+    fields = {ours: config[theirs] for theirs, ours in _FIELDS.items()}
+    return ViT(position_grid=position_grid, **fields)
+
+
+def _as_dinov3(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Add the fields of DINOv3's config to DINOv2's."""
+    known = dict.fromkeys(_DINOV2_SIZES) | dict(config)
+    check_options(known, known["model_type"], dict.fromkeys(_DINOV2_SIZES, SIZE))
+    mlp_dim, gated = known["hidden_size"] * known["mlp_ratio"], "use_swiglu_ffn"
+    if known.get(gated):  # two thirds, rounded up to a multiple of 8
+        mlp_dim = (mlp_dim * 2 // 3 + 7) // 8 * 8
+    derived = {"intermediate_size": mlp_dim, "use_gated_mlp": known.get(gated, False)}
+    return {"num_register_tokens": 0} | known | derived
 
 
 def model_from_tensors(tensors: Mapping[str, Any], source: str) -> ViT:
@@ -152,18 +266,29 @@ def model_from_tensors(tensors: Mapping[str, Any], source: str) -> ViT:
 
     Raises:
         DataError: The tensors are not those of a DINOv3 ViT.
+        UserError: The rotary embedding has other wavelengths.
     """
+    tensors = to_hugging_face(tensors)
     try:
         hidden, _, patch, _ = tensors["embeddings.patch_embeddings.weight"].shape
         mlp_dim, _ = tensors["layer.0.mlp.up_proj.weight"].shape
         _, num_registers, _ = tensors["embeddings.register_tokens"].shape
     except (KeyError, ValueError):
-        raise DataError(f"{source}: not the tensors of a DINOv3 ViT") from None
+        raise DataError(
+            f"{source}: not the tensors of a DINOv3 ViT (DINOv2 is read from its Hugging "
+            "Face folder)"
+        ) from None
     layers = {name.split(".")[1] for name in tensors if name.startswith("layer.")}
+    head_dim = 128 if hidden == 4096 else 64  # 128 in the 7B model
+    if (periods := np.ravel(to_numpy(tensors.get(_PERIODS, [])))).size:
+        head_dim = 4 * periods.size
+        expected = 100.0 ** (np.arange(periods.size) / periods.size)
+        if not np.allclose(periods, expected, rtol=0.01):  # may be rounded to bfloat16
+            raise UserError(f"{source}: {_PERIODS} are not powers of 100")
     return ViT(
         hidden_size=hidden,
         num_layers=len(layers),
-        num_heads=hidden // 64,  # 64 channels per head in all but the 7B model
+        num_heads=hidden // head_dim,
         mlp_dim=mlp_dim,
         patch_size=patch,
         num_registers=num_registers,
@@ -173,7 +298,7 @@ def model_from_tensors(tensors: Mapping[str, Any], source: str) -> ViT:
 
 def image_fields(model: ViT) -> dict[str, Any]:
     """Return the fields of `config.model.image` that describe a backbone."""
-    return {name: getattr(model, name) for name in _FIELDS.values()}
+    return {n: getattr(model, n) for n in (*_FIELDS.values(), "position_grid")}
 
 
 def to_params(
@@ -185,15 +310,21 @@ def to_params(
         DataError: Tensors are missing, unexpected or of another shape. The message lists up
             to 20 of them.
     """
-    # transformers 5 adds a prefix to the names of some models.
-    tensors = {name.removeprefix("model."): t for name, t in tensors.items()}
+    tensors = to_hugging_face(tensors)
     # `from_torch` reports a tensor that is missing or has another shape.
-    with contextlib.suppress(KeyError, ValueError):
+    with contextlib.suppress(KeyError, ValueError, IndexError):
+        if model.position_grid:
+            position = to_numpy(tensors[_POSITIONS])
+            tensors[_CLASS] = to_numpy(tensors[_CLASS]) + position[:, :1]
+            tensors[_POSITIONS] = position[:, 1:]
         tokens = [to_numpy(tensors[name]) for name in (_CLASS, _REGISTERS)]
         tensors[_CLASS] = np.concatenate(tokens, 1)
         del tensors[_REGISTERS]
-    # The mask token is only used in pretraining.
-    ignored = r"embeddings\.mask_token$"
+    for name in [name for name in tensors if name.endswith(".k_proj.bias")]:
+        if model.position_grid or not np.any(tensors[name]):
+            del tensors[name]  # it has no effect, see `vit.Block`
+    # Only used in pretraining, and checked in `model_from_tensors`.
+    ignored = rf"embeddings\.mask_token$|local_cls_norm\.|{_PERIODS}$"
     return from_torch(_RULES, _shapes(model), tensors, source, ignored)["params"]
 
 
