@@ -109,9 +109,8 @@ class ViT(nn.Module):
         if image.shape[1:3] != size:
             image = jax.image.resize(image, (len(image), *size, 3), "linear")
         tokens = self._embed(image, rows, columns)
-        rope = None
-        if not self.position_grid:
-            rope = rotary_angles(rows, columns, self.hidden_size // self.num_heads)
+        head_dim = self.hidden_size // self.num_heads
+        rope = None if self.position_grid else rotary_angles(rows, columns, head_dim)
         block = nn.remat(Block, prevent_cse=False) if self.remat else Block
         # One block is traced for all layers; its parameters have a leading layer axis.
         layers = nn.scan(
@@ -149,14 +148,12 @@ class ViT(nn.Module):
         )(patches)
         if n := self.position_grid:
             shape = (1, n * n, self.hidden_size)
-            position = self.param("position_embedding", _INIT, shape).reshape(n, n, -1)
+            grid = self.param("position_embedding", _INIT, shape).reshape(n, n, -1)
             # transformers resamples with antialiasing only in models with registers.
             smooth = self.num_registers > 0
             axes = [bicubic_weights(n, m, antialias=smooth) for m in (rows, columns)]
-            position = jnp.einsum(
-                "rn,cm,nmd->rcd", *axes, position, precision="highest"
-            )
-            patches += position.reshape(1, rows * columns, -1).astype(self.dtype)
+            grid = jnp.einsum("rn,cm,nmd->rcd", *axes, grid, precision="highest")
+            patches += grid.reshape(1, rows * columns, -1).astype(self.dtype)
         shape = (1, self.num_prefix, self.hidden_size)
         prefix = self.param("prefix_tokens", _INIT, shape).astype(self.dtype)
         prefix = jnp.broadcast_to(prefix, (b, *shape[1:]))

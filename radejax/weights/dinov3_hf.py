@@ -15,6 +15,7 @@ contain them. DINOv2's license is Apache-2.0.
 from __future__ import annotations
 
 import contextlib
+import math
 import pathlib
 import re
 from collections.abc import Mapping
@@ -26,18 +27,11 @@ import numpy as np
 import safetensors.numpy
 
 from radejax.core import files
-from radejax.core.archives import read_safetensors
-from radejax.core.errors import SIZE, DataError, UserError, check_options, require
+from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import PathLike
 from radejax.models.vit import ViT
-from radejax.weights.convert import (
-    Rules,
-    from_torch,
-    read_state_dict,
-    shapes_of,
-    to_numpy,
-    to_torch,
-)
+from radejax.weights import convert
+from radejax.weights.convert import Rules, to_numpy
 
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
@@ -53,11 +47,12 @@ _FIELDS = {
 }
 """Attributes of `ViT` by the name of the corresponding field of Hugging Face's config."""
 
-_DINOV2_SIZES = ("hidden_size", "mlp_ratio", "image_size", "patch_size")
+_KINDS = r"dinov3_vit|dinov2|dinov2_with_registers|vit_\w+_dinov3(_qkvb)?"
+"""Names of models in transformers ("model_type") and, with "vit", in timm ("architecture")."""
 
 
 def _constants(gated_mlp: bool) -> dict[str, Any]:
-    """Return the fields of DINOv3's config for which only one value is supported."""
+    """Return the fields of Hugging Face's config for which only one value is supported."""
     return {
         "model_type": "dinov3_vit",
         "rope_theta": 100.0,
@@ -73,7 +68,7 @@ def _constants(gated_mlp: bool) -> dict[str, Any]:
 
 
 _DINOV2_CONSTANTS = {"layer_norm_eps": 1e-6, "qkv_bias": True, "hidden_act": "gelu"}
-"""The same for DINOv2. Its SwiGLU has SiLU for any `hidden_act`."""
+"""The same for DINOv2, whose SwiGLU has SiLU for any `hidden_act`."""
 
 
 # Names -------------------------------------------------------------------------------
@@ -102,14 +97,12 @@ tensors, into which the tensor is split along its first axis.
 _META_AND_TIMM: Rules = (
     (r"^cls_token$", _CLASS),
     (r"^(storage_tokens|reg_token)$", _REGISTERS),
-    (r"^mask_token$", "embeddings.mask_token"),
     (r"^patch_embed\.proj\.", "embeddings.patch_embeddings."),
     (r"^blocks\.", "layer."),
     (r"\.attn\.qkv\.", ".attention.(q|k|v)_proj."),
     (r"\.attn\.([qv])_bias$", r".attention.\1_proj.bias"),  # timm
     (r"\.attn\.proj\.", ".attention.o_proj."),
-    (r"\.ls(\d)\.gamma$", r".layer_scale\1.lambda1"),
-    (r"\.gamma_(\d)$", r".layer_scale\1.lambda1"),
+    (r"\.(?:ls|gamma_)(\d)(?:\.gamma)?$", r".layer_scale\1.lambda1"),
     (r"\.(fc1|w2|fc1_x)\.", ".up_proj."),
     (r"\.(w1|fc1_g)\.", ".gate_proj."),
     (r"\.(fc2|w3)\.", ".down_proj."),
@@ -131,25 +124,18 @@ def to_hugging_face(tensors: Mapping[str, Any]) -> dict[str, Any]:
     if "blocks.0.gamma_1" in tensors and "blocks.0.attn.q_bias" not in tensors:
         # Most of timm's models are without the biases, because they are zero.
         for name in [n for n in tensors if n.endswith(".attn.qkv.weight")]:
-            zeros = np.zeros(np.shape(tensors[name])[-1:], np.float32)
-            for part in "qv":
-                tensors[name.replace("qkv.weight", f"{part}_bias")] = zeros
-    renamed = {}
+            zeros = np.zeros(np.shape(tensors[name])[:1], np.float32)
+            tensors[name.replace(".weight", ".bias")] = zeros
+    renamed: dict[str, Any] = {}
     for name, value in tensors.items():
-        if name.endswith(".qkv.bias_mask"):
-            continue
-        mask = tensors.get(f"{name}_mask")
-        if np.shape(mask) == np.shape(value):
+        if (mask := tensors.get(f"{name}_mask")) is not None:
             value = to_numpy(value) * to_numpy(mask)
         for pattern, replacement in (*_DINOV2, *_META_AND_TIMM):
             name = re.sub(pattern, replacement, name)
-        start, *parts = re.split(r"[()]", name)
-        if not parts:
-            renamed[name] = value
-            continue
-        fused, names = np.atleast_1d(to_numpy(value)), parts[0].split("|")
-        for part, own in zip(names, np.array_split(fused, len(names)), strict=True):
-            renamed[f"{start}{part}{parts[1]}"] = own
+        start, parts, end = (*re.split(r"[()]", name), "", "")[:3]
+        names = [f"{start}{part}{end}" for part in parts.split("|")]
+        values = np.array_split(np.atleast_1d(to_numpy(value)), len(names))
+        renamed |= zip(names, values, strict=True)
     return renamed
 
 
@@ -173,19 +159,23 @@ def load(folder: PathLike) -> tuple[ViT, dict[str, Any]]:
             shape. The message lists up to 20 of them, with DINOv3's names in Hugging Face.
         UserError: The folder contains another kind of model.
     """
-    folder = files.as_path(folder)
-    if folder.is_file():
-        tensors, source = read_state_dict(folder, "blocks.0.")
-        model = model_from_tensors(tensors, source)
-    else:
-        model, tensors, source = _read_folder(folder)
+    path, config = files.as_path(folder), {}
+    if not path.is_file():
+        config = _read_config(path)
+        path = path / WEIGHTS_FILE
+    tensors, source = convert.read_state_dict(path, "blocks.0.", "embeddings.")
+    model = model_from_tensors(tensors, source)
+    if "model_type" in config:
+        try:
+            model = model_from_config(config, model)
+        except UserError as error:
+            raise UserError(f"{path.with_name(CONFIG_FILE)}: {error}") from None
     return model, {"params": to_params(model, tensors, source)}
 
 
-def _read_folder(folder: pathlib.Path) -> tuple[ViT, dict[str, Any], str]:
-    """Return the model, the tensors and the name of their file."""
-    path = folder / WEIGHTS_FILE
-    if path.with_name(f"{WEIGHTS_FILE}.index.json").is_file():
+def _read_config(folder: pathlib.Path) -> dict[str, Any]:
+    """Read the config of a model of Hugging Face or timm after checking what it describes."""
+    if (folder / f"{WEIGHTS_FILE}.index.json").is_file():
         raise UserError(
             f"{folder} has its weights in several files: load it with transformers and "
             f"write one {WEIGHTS_FILE} with save_pretrained(..., max_shard_size='100GB')"
@@ -197,15 +187,10 @@ def _read_folder(folder: pathlib.Path) -> tuple[ViT, dict[str, Any], str]:
             "folder as downloaded from Hugging Face"
         )
     config = files.read_object(folder / CONFIG_FILE)
-    tensors = read_safetensors(path)
-    try:
-        if timm := config.get("architecture"):
-            is_known = re.match(r"vit_\w+_dinov3", str(timm)) is not None
-            require(is_known, "architecture", timm, "a vit_*_dinov3 of timm")
-            return model_from_tensors(tensors, str(path)), tensors, str(path)
-        return model_from_config(config), tensors, str(path)
-    except UserError as error:
-        raise UserError(f"{folder / CONFIG_FILE}: {error}") from None
+    name = "architecture" if "architecture" in config else "model_type"
+    is_known = re.fullmatch(_KINDS, str(kind := config.get(name))) is not None
+    require(is_known, f"{folder / CONFIG_FILE}: {name}", kind, _KINDS)
+    return config
 
 
 def save(model: ViT, params: Mapping[str, Any], folder: PathLike) -> None:
@@ -228,56 +213,49 @@ def save(model: ViT, params: Mapping[str, Any], folder: PathLike) -> None:
         file.write(content)
 
 
-def model_from_config(config: Mapping[str, Any]) -> ViT:
+def model_from_config(config: Mapping[str, Any], sizes: ViT | None = None) -> ViT:
     """Create the model that a Hugging Face `config.json` describes.
 
+    Args:
+        config: Content of the file.
+        sizes: Model whose fields are used where DINOv2's config has none. Not needed for
+            DINOv3.
+
     Raises:
-        UserError: It does not describe a ViT of DINOv3 or DINOv2, or a field is missing, of
-            a wrong type, out of range or not supported.
+        UserError: It does not describe a DINOv3 or DINOv2 ViT, or a field is missing, of a
+            wrong type, out of range or not supported.
     """
-    kind = config.get("model_type")
-    kinds = ("dinov3_vit", "dinov2", "dinov2_with_registers")
-    require(kind in kinds, "model_type", kind, f"one of {', '.join(kinds)}")
-    constants, position_grid = _constants(config.get("use_gated_mlp") is True), 0
-    if kind != "dinov3_vit":
-        config, constants = _as_dinov3(config), _DINOV2_CONSTANTS
-        position_grid = config["image_size"] // config["patch_size"]
+    constants = _constants(config.get("use_gated_mlp") is True)
+    if sizes is not None and config.get("model_type") != constants["model_type"]:
+        constants = _DINOV2_CONSTANTS
+    elif missing := sorted(set(_FIELDS) - set(config)):
+        raise UserError(f"DINOv3 config lacks {', '.join(missing)}")
     for name, value in constants.items():
         require(config.get(name) == value, name, config.get(name), f"{value!r}")
-    if missing := sorted(set(_FIELDS) - set(config)):
-        raise UserError(f"config of {kind} lacks {', '.join(missing)}")
-    fields = {ours: config[theirs] for theirs, ours in _FIELDS.items()}
-    return ViT(position_grid=position_grid, **fields)
-
-
-def _as_dinov3(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Add the fields of DINOv3's config to DINOv2's."""
-    known = dict.fromkeys(_DINOV2_SIZES) | dict(config)
-    check_options(known, known["model_type"], dict.fromkeys(_DINOV2_SIZES, SIZE))
-    mlp_dim, gated = known["hidden_size"] * known["mlp_ratio"], "use_swiglu_ffn"
-    if known.get(gated):  # two thirds, rounded up to a multiple of 8
-        mlp_dim = (mlp_dim * 2 // 3 + 7) // 8 * 8
-    derived = {"intermediate_size": mlp_dim, "use_gated_mlp": known.get(gated, False)}
-    return {"num_register_tokens": 0} | known | derived
+    fields = {_FIELDS[name]: config[name] for name in _FIELDS if name in config}
+    return (sizes or ViT()).clone(**fields)
 
 
 def model_from_tensors(tensors: Mapping[str, Any], source: str) -> ViT:
-    """Create the model whose sizes are those of DINOv3 tensors by name.
+    """Create the model whose sizes are those of DINOv3 or DINOv2 tensors by name.
 
     Raises:
-        DataError: The tensors are not those of a DINOv3 ViT.
-        UserError: The rotary embedding has other wavelengths.
+        DataError: The tensors are not those of a DINOv3 or DINOv2 ViT.
+        UserError: The rotary embedding has other wavelengths, or DINOv2 is from Meta or timm.
     """
     tensors = to_hugging_face(tensors)
     try:
         hidden, _, patch, _ = tensors["embeddings.patch_embeddings.weight"].shape
         mlp_dim, _ = tensors["layer.0.mlp.up_proj.weight"].shape
-        _, num_registers, _ = tensors["embeddings.register_tokens"].shape
+        none = np.empty((1, 0, hidden))
+        _, num_registers, _ = tensors.get(_REGISTERS, none).shape
+        _, num_positions, _ = tensors.get(_POSITIONS, none).shape
     except (KeyError, ValueError):
         raise DataError(
-            f"{source}: not the tensors of a DINOv3 ViT (DINOv2 is read from its Hugging "
-            "Face folder)"
+            f"{source}: not the tensors of a DINOv3 or DINOv2 ViT"
         ) from None
+    if "pos_embed" in tensors:
+        raise UserError(f"{source}: DINOv2 is read from its Hugging Face folder")
     layers = {name.split(".")[1] for name in tensors if name.startswith("layer.")}
     head_dim = 128 if hidden == 4096 else 64  # 128 in the 7B model
     if (periods := np.ravel(to_numpy(tensors.get(_PERIODS, [])))).size:
@@ -288,10 +266,11 @@ def model_from_tensors(tensors: Mapping[str, Any], source: str) -> ViT:
     return ViT(
         hidden_size=hidden,
         num_layers=len(layers),
-        num_heads=hidden // head_dim,
+        num_heads=max(hidden // head_dim, 1),
         mlp_dim=mlp_dim,
         patch_size=patch,
         num_registers=num_registers,
+        position_grid=math.isqrt(max(num_positions - 1, 0)),
         gated_mlp="layer.0.mlp.gate_proj.weight" in tensors,
     )
 
@@ -324,8 +303,10 @@ def to_params(
         if model.position_grid or not np.any(tensors[name]):
             del tensors[name]  # it has no effect, see `vit.Block`
     # Only used in pretraining, and checked in `model_from_tensors`.
-    ignored = rf"embeddings\.mask_token$|local_cls_norm\.|{_PERIODS}$"
-    return from_torch(_RULES, _shapes(model), tensors, source, ignored)["params"]
+    ignored = rf"(embeddings\.)?mask_token$|local_cls_norm\.|{_PERIODS}$|.*\.bias_mask$"
+    return convert.from_torch(_RULES, _shapes(model), tensors, source, ignored)[
+        "params"
+    ]
 
 
 def to_tensors(model: ViT, params: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -333,7 +314,7 @@ def to_tensors(model: ViT, params: Mapping[str, Any]) -> dict[str, np.ndarray]:
     size, params = model.patch_size, dict(params)
     patches = dict(params["patch_embed"])
     patches["kernel"] = np.reshape(patches["kernel"], (size, size, 3, -1))
-    tensors = to_torch(_RULES, {"params": params | {"patch_embed": patches}})
+    tensors = convert.to_torch(_RULES, {"params": params | {"patch_embed": patches}})
     tokens = tensors[_CLASS]
     tensors[_CLASS] = np.ascontiguousarray(tokens[:, :1])
     if model.num_registers:
@@ -346,4 +327,4 @@ def _shapes(model: ViT) -> dict[str, tuple[int, ...]]:
     image = jax.ShapeDtypeStruct(
         (1, model.patch_size, model.patch_size, 3), jnp.float32
     )
-    return shapes_of(jax.eval_shape(model.init, jax.random.key(0), image))
+    return convert.shapes_of(jax.eval_shape(model.init, jax.random.key(0), image))

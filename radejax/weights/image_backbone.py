@@ -76,13 +76,10 @@ def load_image_backbone(
         vit, variables = dinov3_hf.load(path)
         theirs, ours = map(dinov3_hf.image_fields, (vit, model.vit))
         if lines := differences(theirs, ours, "config.model.image"):
-            names = [
-                "DINOv2" if one.position_grid else "DINOv3" for one in (vit, model.vit)
-            ]
+            kind = "DINOv2" if vit.position_grid else "DINOv3"
             raise UserError(
-                f"{path}: another backbone, a {names[0]} where the config has a {names[1]}: "
-                f"{'; '.join(lines)}; set these fields, or use --config dinorade (DINOv3 "
-                "ViT-S/16) or dinorade:rcw_dinov2 (DINOv2 ViT-S/14)"
+                f"{path} is {kind}, another backbone than config.model.image: "
+                f"{'; '.join(lines)} (dinorade:rcw_dinov2 is the config for DINOv2)"
             )
         part = {"params": {IMAGE_BACKBONE: variables["params"]}}
     if embeddings_sha256 is not None:
