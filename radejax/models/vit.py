@@ -14,6 +14,7 @@ from __future__ import annotations
 import functools
 from typing import Any, Literal, get_args
 
+import chex
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -104,6 +105,7 @@ class ViT(nn.Module):
         self, image: Float[jax.Array, "B H W 3"]
     ) -> Float[jax.Array, "B T {self.hidden_size}"]:
         """Computes float32 tokens of normalized float images `[B, H, W, 3]`."""
+        chex.assert_shape(image, (None, None, None, 3))
         rows, columns = self.grid(*image.shape[1:3])
         size = (rows * self.patch_size, columns * self.patch_size)
         if image.shape[1:3] != size:

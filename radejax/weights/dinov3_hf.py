@@ -189,7 +189,9 @@ def _read_config(folder: pathlib.Path) -> dict[str, Any]:
     config = files.read_object(folder / CONFIG_FILE)
     name = "architecture" if "architecture" in config else "model_type"
     is_known = re.fullmatch(_KINDS, str(kind := config.get(name))) is not None
-    require(is_known, f"{folder / CONFIG_FILE}: {name}", kind, _KINDS)
+    require(
+        is_known, f"{folder / CONFIG_FILE}: {name}", kind, "a ViT of DINOv3 or DINOv2"
+    )
     return config
 
 
@@ -251,9 +253,7 @@ def model_from_tensors(tensors: Mapping[str, Any], source: str) -> ViT:
         _, num_registers, _ = tensors.get(_REGISTERS, none).shape
         _, num_positions, _ = tensors.get(_POSITIONS, none).shape
     except (KeyError, ValueError):
-        raise DataError(
-            f"{source}: not the tensors of a DINOv3 or DINOv2 ViT"
-        ) from None
+        raise DataError(f"{source}: not the tensors of a DINOv3 ViT") from None
     if "pos_embed" in tensors:
         raise UserError(f"{source}: DINOv2 is read from its Hugging Face folder")
     layers = {name.split(".")[1] for name in tensors if name.startswith("layer.")}
