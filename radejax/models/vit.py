@@ -108,8 +108,7 @@ class ViT(nn.Module):
         chex.assert_shape(image, (None, None, None, 3))
         rows, columns = self.grid(*image.shape[1:3])
         size = (rows * self.patch_size, columns * self.patch_size)
-        if image.shape[1:3] != size:
-            image = jax.image.resize(image, (len(image), *size, 3), "linear")
+        image = jax.image.resize(image, (len(image), *size, 3), "linear")
         tokens = self._embed(image, rows, columns)
         head_dim = self.hidden_size // self.num_heads
         rope = None if self.position_grid else rotary_angles(rows, columns, head_dim)
@@ -137,10 +136,7 @@ class ViT(nn.Module):
     def _embed(
         self, image: Float[jax.Array, "B H W 3"], rows: int, columns: int
     ) -> Float[jax.Array, "B T {self.hidden_size}"]:
-        """Embeds patches by a linear layer and prepends the learned tokens.
-
-        The class token includes its position embedding, unlike in DINOv2's files.
-        """
+        """Embeds patches by a linear layer and prepends the learned tokens."""
         b, size = image.shape[0], self.patch_size
         # As patches do not overlap, the convolution is a product with flattened patches.
         patches = image.reshape(b, rows, size, columns, size, 3)
@@ -148,17 +144,20 @@ class ViT(nn.Module):
         patches = nn.Dense(
             self.hidden_size, kernel_init=_INIT, dtype=self.dtype, name="patch_embed"
         )(patches)
+        shape = (1, self.num_prefix, self.hidden_size)
+        prefix = self.param("prefix_tokens", _INIT, shape)
         if n := self.position_grid:
-            shape = (1, n * n, self.hidden_size)
-            grid = self.param("position_embedding", _INIT, shape).reshape(n, n, -1)
+            # Positions of the class token and of the patches.
+            shape = (1, 1 + n * n, self.hidden_size)
+            position = self.param("position_embedding", _INIT, shape)
+            prefix = prefix.at[:, :1].add(position[:, :1])
             # transformers resamples with antialiasing only in models with registers.
             smooth = self.num_registers > 0
             axes = [bicubic_weights(n, m, antialias=smooth) for m in (rows, columns)]
+            grid = position[0, 1:].reshape(n, n, -1)
             grid = jnp.einsum("rn,cm,nmd->rcd", *axes, grid, precision="highest")
             patches += grid.reshape(1, rows * columns, -1).astype(self.dtype)
-        shape = (1, self.num_prefix, self.hidden_size)
-        prefix = self.param("prefix_tokens", _INIT, shape).astype(self.dtype)
-        prefix = jnp.broadcast_to(prefix, (b, *shape[1:]))
+        prefix = jnp.broadcast_to(prefix.astype(self.dtype), (b, *prefix.shape[1:]))
         return jnp.concatenate([prefix, patches], 1)
 
 

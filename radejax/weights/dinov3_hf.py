@@ -121,14 +121,15 @@ _DINOV2: Rules = (  # in Hugging Face, where transformers 5 adds "model." to som
 def to_hugging_face(tensors: Mapping[str, Any]) -> dict[str, Any]:
     """Return the tensors of any source under DINOv3's names in Hugging Face."""
     tensors = dict(tensors)
-    if "blocks.0.gamma_1" in tensors and "blocks.0.attn.q_bias" not in tensors:
+    if "blocks.0.gamma_1" in tensors and not any(n.endswith("_bias") for n in tensors):
         # Most of timm's models are without the biases, because they are zero.
         for name in [n for n in tensors if n.endswith(".attn.qkv.weight")]:
             zeros = np.zeros(np.shape(tensors[name])[:1], np.float32)
             tensors[name.replace(".weight", ".bias")] = zeros
     renamed: dict[str, Any] = {}
     for name, value in tensors.items():
-        if (mask := tensors.get(f"{name}_mask")) is not None:
+        mask = tensors.get(f"{name}_mask", np.ones(()))
+        if mask.shape == value.shape:  # otherwise, the bias of the key is unexpected
             value = to_numpy(value) * to_numpy(mask)
         for pattern, replacement in (*_DINOV2, *_META_AND_TIMM):
             name = re.sub(pattern, replacement, name)
@@ -291,11 +292,7 @@ def to_params(
     """
     tensors = to_hugging_face(tensors)
     # `from_torch` reports a tensor that is missing or has another shape.
-    with contextlib.suppress(KeyError, ValueError, IndexError):
-        if model.position_grid:
-            position = to_numpy(tensors[_POSITIONS])
-            tensors[_CLASS] = to_numpy(tensors[_CLASS]) + position[:, :1]
-            tensors[_POSITIONS] = position[:, 1:]
+    with contextlib.suppress(KeyError, ValueError):
         tokens = [to_numpy(tensors[name]) for name in (_CLASS, _REGISTERS)]
         tensors[_CLASS] = np.concatenate(tokens, 1)
         del tensors[_REGISTERS]

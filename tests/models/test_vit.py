@@ -147,7 +147,7 @@ def test_learned_positions_distinguish_patches():
     variables = drawn(model, images)
     tokens = np.asarray(jax.jit(model.apply)(variables, images))[0, 3:]
     assert np.abs(tokens[:1] - tokens[1:]).max(-1).min() > 1e-3
-    chex.assert_shape(variables["params"]["position_embedding"], (1, 9, 16))
+    chex.assert_shape(variables["params"]["position_embedding"], (1, 10, 16))
 
 
 @pytest.mark.slow

@@ -310,6 +310,10 @@ def test_other_folders_are_rejected(sources, name, change, message, tmp_path):
         ),
         ({"blocks.0.ls1.gamma": np.full(32, np.nan)}, "layer_scale1.* not finite"),
         ({"pos_embed": np.zeros((1, 17, 32))}, "DINOv2 is read from its Hugging Face"),
+        (
+            {"blocks.0.attn.qkv.bias_mask": np.ones(2)},
+            "unexpected layer.0.*k_proj.bias",
+        ),
         ({"cls_norm.weight": np.ones(32)}, "unexpected cls_norm.weight"),
     ],
 )
@@ -318,6 +322,15 @@ def test_other_files_are_rejected(sources, change, message, tmp_path):
     change = {name: value.astype(np.float32) for name, value in change.items()}
     path = write(tmp_path, "meta", tensors | change, config)
     with pytest.raises((UserError, DataError), match=message):
+        dinov3_hf.load(path)
+
+
+@pytest.mark.parametrize("part", "qv")
+def test_a_missing_bias_is_not_zero(sources, part, tmp_path):
+    tensors, config = description(sources, "timm_qkvb")
+    del tensors[f"blocks.0.attn.{part}_bias"]
+    path = write(tmp_path, "timm_qkvb", tensors, config)
+    with pytest.raises(DataError, match=rf"1 problems: missing .*{part}_proj.bias"):
         dinov3_hf.load(path)
 
 

@@ -81,6 +81,5 @@ def test_dinov2_small_has_the_sizes_of_its_config():
         model.vit.init, jax.random.key(0), np.zeros((1, 28, 28, 3), np.float32)
     )
     count = sum(leaf.size for leaf in jax.tree.leaves(shapes))
-    # 22,056,576 parameters, of which a mask token, the biases of the keys, and the position
-    # of the class token (added to it here) are not needed.
-    assert count == 22_056_576 - (1 + 12 + 1) * 384
+    # 22,056,576 parameters, of which a mask token and the biases of the keys are not needed.
+    assert count == 22_056_576 - (1 + 12) * 384
