@@ -85,23 +85,6 @@ def project_file(
     return projection
 
 
-def check_tesseract(
-    path: PathLike,
-    *,
-    shape_drea: tuple[int, ...] | None = None,
-    deep: bool = False,
-) -> None:
-    """Raise the errors of `project_file` that header and size of a file show.
-
-    With `deep`, the file is read and projected, which also detects corrupted values.
-    """
-    if deep:
-        project_file(path, shape_drea=shape_drea)
-    else:
-        with _opened(path, shape_drea):
-            pass
-
-
 def read_projection_npy(
     path: PathLike, *, projection_shape: tuple[int, ...] | None = None
 ) -> Float[np.ndarray, "R A DE"]:
@@ -131,11 +114,6 @@ def read_projection_npy(
     if (share := np.mean(stored == 0)) > MAX_ZERO_SHARE:
         raise DataError(f"{path}: corrupted, {share:.0%} of the values are exactly 0")
     return np.ascontiguousarray(stored.transpose(axes))
-
-
-def check_projection_npy(path: PathLike, projection_shape: tuple[int, ...]) -> None:
-    """Raise the errors of `read_projection_npy` that header and size of a file show."""
-    _projection_axes(path, read_npy(path, mapped=True), projection_shape)
 
 
 def _projection_axes(
@@ -169,6 +147,20 @@ def read_frame(path: PathLike, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
         return project_file(path, shape_drea=grid.shape_drea)
     projection = read_projection_npy(path, projection_shape=grid.projection_shape)
     return projection.astype(np.float32)
+
+
+def check_frame(path: PathLike, grid: RadarGrid, *, deep: bool = False) -> None:
+    """Raise the errors of `read_frame` that header and size of a file show.
+
+    With `deep`, the whole file is read, which also detects corrupted values.
+    """
+    if deep:
+        read_frame(path, grid)
+    elif pathlib.Path(path).suffix == ".npy":
+        _projection_axes(path, read_npy(path, mapped=True), grid.projection_shape)
+    else:
+        with _opened(path, grid.shape_drea):
+            pass
 
 
 @contextlib.contextmanager
