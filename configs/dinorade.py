@@ -17,7 +17,8 @@ The argument is a list of options, at most one of each group:
 - sigma: `sigma3`, `sigma0.75`, `adaptive`, `anisotropic`, as in `radenet.py`.
 - classes: `all` (default; five classes, v2.1 labels) or `sedan` (v1.1 labels).
 
-Table 4 reports (Sedan AP of the five-class models, narrow region, IoU 0.3):
+Table 4 reports (Sedan AP of the five-class models, without the option `sedan`, narrow region,
+IoU 0.3):
 
 | variant | AP 3D | AP BEV |
 |---|---|---|

@@ -229,6 +229,9 @@ _FIELDS: dict[str, Any] = {
         "batch_size": 10,
         # Passes over the training data; at least 1.
         "num_epochs": 10,
+        # Steps after which the training ends if its epochs are longer, at least 1; the
+        # learning rate decreases over the steps that are taken. None: all epochs.
+        "max_steps": placeholder(int),
         # Peak learning rate of AdamW; above 0.
         "learning_rate": 1e-3,
         # Final learning rate, from 0 to the peak.

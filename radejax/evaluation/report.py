@@ -1,11 +1,13 @@
 """The report of an evaluation: console text, JSON, CSV, Markdown, LaTeX and figures.
 
-`published.csv` contains the result tables of the RADE-Net and DinoRADE papers, with one
-line per class, space and IoU threshold of a printed row, in the order of the papers. The
-values are average precisions in percent, "-" if the paper prints "-", and empty if its
-table has no such column. Values of 0.99 (1/101, the lower bound of the protocol) are kept
-as printed. A difference to a published row is printed only if protocol, labels, region
-and split agree. Results of simulated frames are not printed next to published rows.
+`published.csv` contains the result tables of the RADE-Net and DinoRADE papers, in their
+order, and then other methods as their own repositories, logs or abstracts print them, with
+one line per class, space and IoU threshold of a printed row. The values are average
+precisions in percent, "-" if the source prints "-", and empty if it has no such column.
+Values of 0.99 (1/101, the lower bound of the protocol) are kept as printed; logs are
+rounded to two decimals. A difference to a published row is printed only if protocol, score
+threshold, labels, region and split agree. Results of simulated frames are not printed next
+to published rows.
 
 References:
     RADE-Net: Leitgeb et al., "RADE-Net: Robust Attention Network for Radar-Only Object
@@ -21,6 +23,7 @@ import functools
 import importlib.resources
 import itertools
 import pathlib
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -420,22 +423,46 @@ class PublishedRow:
     """One row of a published table.
 
     Attributes:
-        source: Paper and table, such as "DinoRADE, Table 2".
+        source: Paper and table, such as "DinoRADE, Table 2", or repository and file.
         method: Name of the row; in ablations, the components that the row includes.
-        modality: Sensors: L for LiDAR, C for camera, R for radar.
+        sensors: L for LiDAR, C for camera, R for radar.
         label_version: K-Radar label revision.
-        protocol: Evaluation protocol as far as known.
+        label_origin: "stated" by the source, or where the revision is known from.
+        protocol: Evaluation protocol, or "not stated", as also in the next two fields.
+        score_threshold: Predictions with a higher score were evaluated.
+        region: Region of interest, "narrow" or "wide".
+        code: Repository of the method, "none", or "not stated".
+        config: Config that trains the method, or "not trainable here".
         note: Remark on the row.
-        values: APs as printed. The class "mean" is the mAP of the paper.
+        values: APs as printed. The class "mean" is the mAP of the source.
     """
 
     source: str
     method: str
-    modality: str
+    sensors: str
     label_version: str
+    label_origin: str
     protocol: str
+    score_threshold: str
+    region: str
+    code: str
+    config: str
     note: str
     values: dict[Cell, str]
+
+    @property
+    def terms(self) -> str:
+        """Protocol, and what is known of score threshold, labels and region."""
+        origin = "" if self.label_origin == "stated" else f" ({self.label_origin})"
+        terms = (
+            self.protocol.replace("not stated", "protocol not stated"),
+            f"score>{self.score_threshold}",
+            f"labels={self.label_version}{origin}",
+            f"roi={self.region}",
+        )
+        return ", ".join(
+            term for term in terms if not re.search("[>=]not stated", term)
+        )
 
     def differences(
         self,
@@ -450,8 +477,10 @@ class PublishedRow:
         """
         is_comparable = (
             options.paper_protocol == self.protocol
+            and options.settings_of(self.protocol)["score_threshold"]
+            == float(self.score_threshold)
             and options.label_version == self.label_version
-            and roi_name(options.roi) == "narrow"
+            and roi_name(options.roi) == self.region
             and split == "test"
             and self.source not in _ABLATIONS
         )
@@ -471,7 +500,6 @@ def _read() -> tuple[PublishedRow, ...]:
     text = importlib.resources.files(__package__) / "published.csv"
     rows: dict[tuple[str, ...], PublishedRow] = {}
     for line in csv.DictReader(text.read_text(encoding="utf-8").splitlines()):
-        line["source"] = f"{line['paper']}, Table {line['table']}"
         fields = {name: line[name] for name in names}
         row = rows.setdefault(tuple(fields.values()), PublishedRow(**fields, values={}))
         for condition in filter(line.get, CONDITIONS):
@@ -481,7 +509,7 @@ def _read() -> tuple[PublishedRow, ...]:
 
 
 PUBLISHED = _read()
-"""All rows of all result tables of both papers."""
+"""All rows of all result tables of both papers, and of other sources."""
 
 
 # A run in the layouts of the papers ---------------------------------------------------
@@ -534,7 +562,17 @@ def paper_tables(
         [{"cls": "Sedan"}],
         _crossed([{"iou": 0.3}, {"iou": 0.5}], _BOTH),
     )
-    return [by_weather, *built, ablations]
+    others = layout(
+        "Other methods, all weathers, as printed elsewhere",
+        [row.source for row in PUBLISHED if ", Table" not in row.source],
+        [
+            group
+            for group in classes
+            if group["cls"] in ("Sedan", "Bus or Truck", "mean")
+        ],
+        _crossed([{"iou": 0.3}, {"iou": 0.5}], _BOTH),
+    )
+    return [by_weather, *built, ablations, others]
 
 
 def _crossed(outer: Sequence[Place], inner: Sequence[Place]) -> list[Place]:
@@ -576,12 +614,11 @@ def _layout(
             if row.source not in sources or set(values) == {"-"} or is_repeated:
                 continue
             printed.append([row.method, *values])
-            terms = f"{row.protocol}, labels={row.label_version}"
-            name = f"{row.method} ({row.modality})"
-            body.append([name, of, row.source, terms, *values])
+            name = f"{row.method} ({row.sensors})"
+            body.append([name, of, row.source, row.terms, *values])
             gaps = row.differences(cells, compared, options, split)
             if set(gaps) != {"-"}:
-                same = "same protocol, labels, region, split"
+                same = "same protocol, score, labels, region, split"
                 body.append(["difference", of, row.source, same, *gaps])
         for protocol in options.main_protocols:
             aps = [ap_of(results, protocol, *cell) for cell in cells]

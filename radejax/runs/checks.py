@@ -63,6 +63,7 @@ _DATA = {
 _TRAIN = {
     "batch_size": integer(1),
     "num_epochs": integer(1),
+    "max_steps": or_none(integer(1)),
     "learning_rate": POSITIVE,
     "final_learning_rate": number(0),
     "schedule": one_of("cosine", "cyclic_cosine"),

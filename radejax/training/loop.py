@@ -30,6 +30,7 @@ from radejax.training.step import (
     Metrics,
     Step,
     TrainState,
+    count_steps,
     create_state,
     make_optimizer,
     make_schedule,
@@ -63,7 +64,7 @@ def train(
     evaluate: Evaluate | None = None,
     profile: str = "",
 ) -> tuple[TrainState, bool]:
-    """Trains a model for the configured epochs, or continues from the newest checkpoint.
+    """Trains a model for the configured epochs or steps, or continues from the newest checkpoint.
 
     Args:
         config: Config of the run, which `radejax.runs.checks.check` has checked. The
@@ -119,7 +120,7 @@ def train(
             checkpoints, loader, info, initial, create, mesh, options.parameter_sharding
         )
         train_step = _compile(step_fn, state, mesh, config.seed)
-        num_steps = steps_per_epoch * options.num_epochs
+        num_steps = count_steps(options, steps_per_epoch)
         with (
             MetricLogger(folder, config, int(state.step), num_steps) as logger,
             distributed.stop_on_signal(mesh) as stop,

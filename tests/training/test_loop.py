@@ -7,6 +7,7 @@ import pathlib
 import signal
 from collections.abc import Iterator
 from typing import Any
+from unittest import mock
 
 import chex
 import grain
@@ -32,6 +33,7 @@ def compiled_once() -> Iterator[None]:
     Runs differ in what happens around their steps, and tracing takes the longest.
     """
     fields = ("learning_rate", "final_learning_rate", "warmup_steps", "num_epochs")
+    fields = (*fields, "max_steps")
 
     def key(x: Any) -> Any:
         if isinstance(x, ConfigDict):
@@ -132,6 +134,22 @@ def test_a_run_ends_after_its_epochs_and_learns(undisturbed: Any) -> None:
     losses = _losses(folder)
     assert [step for step, _ in losses] == list(range(1, 9))
     assert losses[-1][1] < losses[0][1]
+
+
+@pytest.mark.parametrize(("max_steps", "expected"), [(5, 5), (20, 8)])
+def test_a_run_ends_after_the_given_steps(
+    run: Any, tiny: Tiny, tmp_path: pathlib.Path, max_steps: int, expected: int
+) -> None:
+    config = tiny.config.copy_and_resolve_references()
+    config.train.update(max_steps=max_steps, evaluate_every_epochs=1)
+    evaluate = mock.Mock(return_value=Scores({}, best=1.0))
+    state, is_finished = run(tmp_path, config=config, evaluate=evaluate)
+    assert is_finished
+    assert state.step == expected
+    assert evaluate.call_count == 2  # after the first epoch and at the end
+    again, is_finished = run(tmp_path, config=config)  # there is nothing left to do
+    assert is_finished
+    chex.assert_trees_all_equal(again, state)
 
 
 @pytest.mark.slow
