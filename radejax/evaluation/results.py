@@ -37,8 +37,13 @@ LEVEL = 0.95
 _RANGES = {
     "iou_thresholds": several(BELOW_ONE, "different numbers in [0, 1)", least=1),
     "protocols": several(
-        one_of(*protocols.PROTOCOLS),
-        f"different ones of {', '.join(protocols.PROTOCOLS)}",
+        (
+            lambda name: bool(
+                protocols.get_protocol(name, "config.evaluation.protocols")
+            ),
+            "",
+        ),
+        f"different ones of {', '.join(protocols.PROTOCOLS)} or module:Object",
         least=1,
     ),
     "score_threshold": number(0, 1),
@@ -342,7 +347,7 @@ def condition_masks(frames: AnyColumns, kind: str) -> dict[str, Bool[np.ndarray,
 
 def exclusion_counts(data: EvaluationSet, options: EvaluationOptions) -> dict[str, int]:
     """Counts the boxes and frames that are excluded from the results, by reason."""
-    fixed = [p for p in options.protocols if protocols.PROTOCOLS[p].is_fixed]
+    fixed = [p for p in options.protocols if protocols.get_protocol(p).is_fixed]
     threshold = max(options.score_threshold, options.min_score)
     is_kept = data.score > threshold
     but = f" (counted by {', '.join(fixed)})" if threshold > options.min_score else ""

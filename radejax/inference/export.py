@@ -136,6 +136,9 @@ def export(
     }
 
 
+_NAMES = {"radenet": "RADE-Net", "dinorade": "DinoRADE"}
+
+
 def _readme(detector: Detector, is_tensor: bool, left_out: Sequence[str]) -> str:
     """Return the text of the model card."""
     grid = detector.grid
@@ -145,7 +148,7 @@ def _readme(detector: Detector, is_tensor: bool, left_out: Sequence[str]) -> str
     config = detector.saved.config
     is_simulated = (config.get("simulation") or {}).get("scenes") == "procedural"
     return _MODEL_CARD.read_text().format(
-        name={"radenet": "RADE-Net", "dinorade": "DinoRADE"}[config.model.name],
+        name=_NAMES.get(config.model.name, config.model.name),
         classes=", ".join(detector.classes),
         input=f"{radar}, B frames.",
         radejax=radejax.__version__,
