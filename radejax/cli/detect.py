@@ -24,6 +24,7 @@ from radejax.cli import entry
 @click.option("--out", required=True, type=entry.FOLDER, help="Folder of the boxes.")
 @entry.step
 @entry.part
+@entry.camera_calibration
 @click.option(
     "--score-threshold",
     type=entry.FRACTION,
@@ -70,7 +71,8 @@ def detect(
     if count["clipped"]:
         text += f"; {count['clipped']} with a size that was clipped to be positive"
     if "radar_only" in count:
-        text += f"; {count['radar_only']} without an image, from the radar only"
+        text += f"; {count['radar_only']} without a label file, image or camera "
+        text += "calibration, from the radar only"
     entry.echo_result(as_json, {**count, "out": str(out)}, text)
 
 

@@ -104,9 +104,8 @@ def find_part(
                 f"{field} is {name!r}: {error}; start Python in the folder of {module}, or "
                 "add that folder to PYTHONPATH"
             ) from None
-    is_class = isinstance(part, type)
-    is_fine = issubclass(part, kind) if is_class else isinstance(part, kind)
-    require(is_fine, field, name, f"the name of a {kind.__name__}")
+    is_kind = kind in getattr(part, "__mro__", type(part).__mro__)
+    require(is_kind, field, name, f"the name of a {kind.__name__}")
     return part
 
 

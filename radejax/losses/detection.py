@@ -75,6 +75,7 @@ class LossOptions:
 
     def __post_init__(self) -> None:
         terms = self.terms
+        own = terms.keys() - LOSSES.keys()
         ranges: dict[str, Range] = {
             "heatmap_sigma_mode": one_of(*get_args(SigmaMode)),
             "heatmap_sigma_bins": POSITIVE,
@@ -82,18 +83,17 @@ class LossOptions:
             "gwd_tau": POSITIVE,
             "assignment": one_of(*get_args(Assignment)),
             "weights": (
-                lambda weights: set(weights) <= set(terms) and _are_weights(weights),
-                f"numbers of at least 0, not all 0, for some of {', '.join(terms)}",
-            ),
-            "own_terms": (
-                lambda _: terms.keys() - LOSSES.keys() <= set(self.weights),
-                f"functions that have a weight, one of {', '.join(self.weights)}",
+                lambda weights: (
+                    own <= set(weights) <= set(terms) and _are_weights(weights)
+                ),
+                f"numbers of at least 0, not all 0, for some of {', '.join(terms)}, and "
+                "for all of own_terms",
             ),
         }
         check_options(vars(self), "config.loss", ranges)
 
     @property
-    def terms(self) -> dict[str, Term]:
+    def terms(self) -> dict[str, Callable[..., Float[jax.Array, ""]]]:
         """All losses by the names that `weights` has."""
         own = {
             place.partition(":")[2]: find_part(place, "config.loss.own_terms", {})
@@ -176,8 +176,7 @@ def detection_loss(
         jnp.where(row, expected, 1.0),
         is_matched,
     )
-    losses = chosen.terms
-    terms = {name: losses[name](pairs, chosen) for name in chosen.weights}
+    terms = {name: chosen.terms[name](pairs, chosen) for name in chosen.weights}
     total = _weighted_sum(terms, chosen.weights, chosen.normalize)
     terms["weighted_sum"] = _weighted_sum(terms, chosen.weights, False)
     counted = {"objects": is_valid, "positive": target >= 1, "matched": is_matched}
@@ -230,9 +229,7 @@ def _smooth_l1(pairs: Pairs, options: LossOptions) -> Float[jax.Array, ""]:
     return pairs.mean(jnp.mean(smooth_l1(pairs.predicted - pairs.expected), -1))
 
 
-Term = Callable[[Pairs, LossOptions], Float[jax.Array, ""]]
-
-LOSSES: dict[str, Term] = {
+LOSSES: dict[str, Callable[..., Float[jax.Array, ""]]] = {
     "focal": _focal,
     "gwd": _gwd,
     "smooth_l1": _smooth_l1,
