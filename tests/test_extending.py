@@ -253,9 +253,9 @@ def test_the_protocol_counts_every_frame() -> None:
         (
             "loss.own_terms",
             ("parts:height_loss", "json:loads"),
-            "expected functions that have a weight, one of focal",
+            "smooth_l1, height_loss, loads, and for all of own_terms",
         ),
-        ("loss.own_terms", (), "for some of focal, gwd, smooth_l1"),
+        ("loss.own_terms", (), "for some of focal, gwd, smooth_l1, and"),
         ("evaluation.protocols", ("parts:PowerNet",), "the name of a Protocol"),
         ("data.format", "parts:PowerNet", "expected the name of a LabelledFrames"),
     ],

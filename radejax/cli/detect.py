@@ -71,8 +71,8 @@ def detect(
     if count["clipped"]:
         text += f"; {count['clipped']} with a size that was clipped to be positive"
     if "radar_only" in count:
-        text += f"; {count['radar_only']} without a label file, image or camera "
-        text += "calibration, from the radar only"
+        reason = "without a label file, image or calibration"
+        text += f"; {count['radar_only']} {reason}, from the radar only"
     entry.echo_result(as_json, {**count, "out": str(out)}, text)
 
 

@@ -98,8 +98,8 @@ def _undrawn(frames: Any) -> str:
     if not images + calibrations:
         return ""
     return (
-        f"; no boxes on images that lack something: of {len(frames)} frames, {images} have "
-        f"no front image, {calibrations} no camera calibration (--camera-calibration FOLDER)"
+        f"; not all have boxes on the image: {images} of {len(frames)} frames have no front "
+        f"image, {calibrations} no camera calibration (--camera-calibration FOLDER)"
     )
 
 

@@ -86,12 +86,8 @@ _ALL = (
 PROTOCOLS = {protocol.name: protocol for protocol in _ALL}
 
 
-def get_protocol(name: str, field: str = "protocol") -> Protocol:
-    """Returns the protocol of a name.
-
-    Args:
-        name: Name of one of `PROTOCOLS`, or "module:Object", which is then its name.
-        field: Name of the field for the error message.
+def get_protocol(name: str) -> Protocol:
+    """Returns the protocol of a name, or of "module:Object", which is then its name.
 
     Raises:
         UserError: There is no such protocol; the message lists all.
@@ -100,7 +96,7 @@ def get_protocol(name: str, field: str = "protocol") -> Protocol:
         >>> get_protocol("kradar_r40").name
         'kradar_r40'
     """
-    found = find_part(name, field, PROTOCOLS, Protocol)
+    found = find_part(name, "protocols", PROTOCOLS, Protocol)
     return dataclasses.replace(found, name=name)
 
 

@@ -36,16 +36,7 @@ LEVEL = 0.95
 
 _RANGES = {
     "iou_thresholds": several(BELOW_ONE, "different numbers in [0, 1)", least=1),
-    "protocols": several(
-        (
-            lambda name: bool(
-                protocols.get_protocol(name, "config.evaluation.protocols")
-            ),
-            "",
-        ),
-        f"different ones of {', '.join(protocols.PROTOCOLS)} or module:Object",
-        least=1,
-    ),
+    "protocols": several((bool, ""), "different names, such as all_point", least=1),
     "score_threshold": number(0, 1),
     "empty_frames": one_of(*protocols.EMPTY_FRAMES),
     "min_score": number(0, 1),
@@ -94,6 +85,8 @@ class EvaluationOptions:
     def __post_init__(self) -> None:
         check_options(vars(self), "config.evaluation", _RANGES)
         try:
+            for name in self.protocols:
+                protocols.get_protocol(name)
             roi_bounds(self.roi)
         except UserError as error:
             raise UserError(f"config.evaluation.{error}") from None

@@ -301,7 +301,7 @@ def evaluate_run(
     if other is not None:
         frames = data.split(split)
         images = data.images(frames)
-        require_images(frames, images, split)
+        require_images(frames, images, f"{split} split")
         if images is not None:
             check_backbone(images.empty_images(1), saved.variables)
         if out is None:

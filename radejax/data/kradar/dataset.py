@@ -301,9 +301,7 @@ class KRadar(LabelledFrames[Frame]):
             return set(read_split(split))
         paths = {name: self._split_files(name) for name in ("train", "test")}
         entries = {
-            name: {key for path in files for key in read_split(path)}
-            for name, files in paths.items()
-            if files
+            n: set[Key]().union(*map(read_split, of)) for n, of in paths.items() if of
         }
         if len(entries) == 2 and (both := sorted(entries["train"] & entries["test"])):
             train, test = (", ".join(map(str, files)) for files in paths.values())
