@@ -122,6 +122,22 @@ def test_configs_may_name_the_parts_and_the_model_has_them() -> None:
     assert len(made["backbone"]) == 3
 
 
+def test_own_models_may_have_a_camera(tmp_path: pathlib.Path) -> None:
+    text = (
+        "from radejax.models.dinorade import DinoRade\n"
+        "class Own(DinoRade, kw_only=True):\n    gain: float = 1.0\n"
+    )
+    (tmp_path / "modules" / "parts.py").write_text(text)
+    config = small.camera_config().model
+    config.update(name="parts:Own", gain=2.0)
+    model = models.build(config)
+    assert models.has_camera(model)
+    assert type(model).__name__ == "Own"
+    del config.gain
+    with pytest.raises(UserError, match=r"config\.model\.gain is missing"):
+        models.build(config)
+
+
 def test_the_config_of_the_page_is_complete() -> None:
     (block,) = (block for block in BLOCKS if "def get_config" in block)
     found: dict[str, Any] = {}
@@ -328,7 +344,7 @@ def test_own_parts_are_imported_wherever_a_run_is_opened(
     monkeypatch.undo()  # the folder of parts.py is not searched any more
     _forget()
     with pytest.raises(
-        UserError, match=r"is 'parts:\w+': No module named 'parts'; start"
+        UserError, match=r"is 'parts:\w+': No module named 'parts'; run"
     ):
         Detector.from_workdir(folder)
 

@@ -70,7 +70,7 @@ def detect(
     text = f"{count['boxes']} boxes in {count['frames']} frames written to {out}"
     if count["clipped"]:
         text += f"; {count['clipped']} with a size that was clipped to be positive"
-    if "radar_only" in count:
+    if count.get("radar_only"):
         reason = "without a label file, image or calibration"
         text += f"; {count['radar_only']} {reason}, from the radar only"
     entry.echo_result(as_json, {**count, "out": str(out)}, text)

@@ -101,8 +101,8 @@ def find_part(
             part = getattr(importlib.import_module(module), attribute)
         except (ImportError, AttributeError) as error:
             raise UserError(
-                f"{field} is {name!r}: {error}; start Python in the folder of {module}, or "
-                "add that folder to PYTHONPATH"
+                f"{field} is {name!r}: {error}; run this in the folder of {module}, or add "
+                "that folder to PYTHONPATH"
             ) from None
     is_kind = kind in getattr(part, "__mro__", type(part).__mro__)
     require(is_kind, field, name, f"the name of a {kind.__name__}")
