@@ -70,6 +70,8 @@ def detect(
     text = f"{count['boxes']} boxes in {count['frames']} frames written to {out}"
     if count["clipped"]:
         text += f"; {count['clipped']} with a size that was clipped to be positive"
+    if "repeated" in count:
+        text += f"; {count['repeated']} without a preceding frame, which were repeated"
     if count.get("radar_only"):
         reason = "without a label file, image or calibration"
         text += f"; {count['radar_only']} {reason}, from the radar only"

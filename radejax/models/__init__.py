@@ -20,7 +20,7 @@ from radejax.models.vit import ViT
 _MODELS = {"radenet": RadeNet, "dinorade": DinoRade}
 
 
-def build(config: Mapping[str, Any]) -> nn.Module:
+def build(config: Mapping[str, Any], num_frames: int = 1) -> nn.Module:
     """Creates the model that `config.model` describes.
 
     Args:
@@ -28,6 +28,7 @@ def build(config: Mapping[str, Any]) -> nn.Module:
             derived from either, and exactly the fields of that model. The fields of RADE-Net
             are the attributes of `RadeNet`, where `cbam` may be "off". DinoRADE additionally
             has the sections `image`, `fusion` and `query_grid`.
+        num_frames: `config.data.num_frames`, the number of frames of a sample.
 
     Returns:
         A Flax module without parameters.
@@ -43,7 +44,8 @@ def build(config: Mapping[str, Any]) -> nn.Module:
     if is_camera:
         expected -= _own_fields(DinoRade) - _own_fields(RadeNet)
         expected |= {"image", "fusion", "query_grid"}
-    _check_keys(fields, expected, "")
+    _check_keys(fields, expected - {"num_frames"}, "")
+    fields["num_frames"] = num_frames
     if fields["cbam"] == "off":
         fields["cbam"] = None
     try:
