@@ -1,0 +1,325 @@
+"""K-Radar's reduced releases: mean power and mean Doppler instead of 4D radar tensors.
+
+- `polar3d_<radar>.npy` holds `[2, R, A, E]`: linear power, averaged over all Doppler bins
+  but the first and divided by 1e13, and the power-weighted mean Doppler in m/s.
+- `rpc_<radar>.npy` holds the strongest cells of it as points `[N, 11]`: x, y, z, power,
+  mean Doppler, range, azimuth, elevation and the bins of the last three. Azimuth and
+  elevation are negated: positive to the left and upwards. Older files `[N, 5]` end after
+  the Doppler.
+
+Both become projections `[R, A, D+E]` on the scale of `project_tensor`. A cell of mean power
+m (in the unit of the tensor) has the level (10 log10(m + 1e-10) + 1.2) / 184.3, where
+`project_tensor` has the maximum of the power over Doppler. For noise of exponentially
+distributed power, the maximum of 64 bins is 6.8 dB above the mean on average (0.037 levels);
+for an echo in a single bin, at most 18 dB (0.098 levels). The Doppler half is reconstructed:
+each cell contributes its level at the bin of its mean Doppler, and the maximum over elevation
+is taken. Other Doppler bins have the lowest level over elevation. Cells without a point have
+the level of the weakest point, which is an upper bound.
+
+References:
+    K-Radar, `datasets/kradar_detection_v2_1.py` (commit 97fe0a6): `get_cube_polar` and
+    `get_proportional_rdr_points`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int, Real
+
+from radejax.core.archives import read_npy
+from radejax.core.errors import DataError, require
+from radejax.core.files import PathLike
+from radejax.data.projection import MAX_ZERO_SHARE, to_log_scale
+from radejax.geometry.radar_grid import RadarGrid
+
+RELEASES = ("polar3d", "rpc")
+"""Reduced releases, by the first part of the names of their files."""
+
+POWER_UNIT = 1e13
+"""Released powers are linear power divided by this."""
+
+_KRADAR_DOPPLER_MPS = np.linspace(-1.932591218305504, 1.872197742733457, 64)
+"""K-Radar's Doppler axis, of which `RadarGrid.kradar` has six decimals."""
+
+_ROWS = 16
+"""Ranges that are projected at a time, so that they stay in the cache."""
+
+_NAMES = ("polar3d_", "rpc_", "sprdr_")
+_MAX_POWER = 1e6  # far above any echo divided by POWER_UNIT, far below undivided noise
+_DECIBELS = (20.0, 300.0)  # range of undivided noise and echoes in decibels
+
+
+def is_reduced_file(path: PathLike) -> bool:
+    """Returns True if a file has the name of a reduced release's file."""
+    return str(path).rpartition("/")[2].startswith(_NAMES)
+
+
+def is_reduced(frame: Real[np.ndarray, "..."], grid: RadarGrid) -> bool:
+    """Returns True if an array is a frame of a reduced release by its shape.
+
+    Without a Doppler axis, a `polar3d` frame has the shape of two projections. It is then
+    recognized by the negative values of its Doppler.
+    """
+    if frame.ndim == 2:
+        return True
+    is_polar = frame.shape == _polar_shape(grid) != grid.shape_drea
+    is_unique = frame.shape[1:] != grid.projection_shape
+    return is_polar and (is_unique or bool(frame[1].min() < 0))
+
+
+def read_reduced(path: PathLike, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
+    """Computes `project_reduced` of a file.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        DataError: The file is corrupted, or see `project_reduced`.
+    """
+    return project_reduced(read_npy(path, mapped=True), grid, str(path))
+
+
+def check_reduced(path: PathLike, grid: RadarGrid) -> None:
+    """Raises the errors of `read_reduced` that header and size of a file show."""
+    _check_layout(read_npy(path, mapped=True), grid, str(path))
+
+
+def project_reduced(
+    frame: Real[np.ndarray, "..."], grid: RadarGrid, name: str = "frame"
+) -> Float[np.ndarray, "R A DE"]:
+    """Computes the float32 projection of a frame of a reduced release.
+
+    Points `[N, 5]` at range 0 are left out, because their direction is not known.
+
+    Args:
+        frame: `polar3d` array `[2, R, A, E]`, or points `[N, 11]` or `[N, 5]`.
+        grid: Axes of the radar. Without Doppler bins, the projection is `[R, A, E]`.
+        name: Name of the frame in messages.
+
+    Raises:
+        DataError: Shape, type or scale differ from those of the release, or a point does
+            not lie at a bin of the grid.
+    """
+    _check_layout(frame, grid, name)
+    projection = np.empty(grid.projection_shape, np.float32)
+    elevation = projection[..., grid.num_doppler :]
+    if frame.ndim == 2:
+        if frame.shape[1] == 5:
+            frame = frame[np.any(frame[:, :3] != 0, axis=1)]
+        power, doppler = frame[:, 3], frame[:, 4]
+        _check_values(power, doppler, grid, name)
+        bins, levels = _bins_of_points(frame, grid, name), _levels(power)
+        projection[...] = levels.min()
+        elevation[bins] = levels
+        _add_doppler(
+            projection, bins[0] * grid.num_azimuth + bins[1], levels, doppler, grid
+        )
+        return projection
+    power, doppler = frame
+    _check_values(power, doppler, grid, name)
+    beams = np.arange(_ROWS * grid.num_azimuth).reshape(_ROWS, -1, 1)
+    for start in range(0, grid.num_range, _ROWS):
+        rows = slice(start, start + _ROWS)
+        levels, part = _levels(power[rows]), projection[rows]
+        elevation[rows] = levels
+        part[..., : grid.num_doppler] = levels.min(axis=-1, keepdims=True)
+        _add_doppler(part, beams[: len(part)], levels, doppler[rows], grid)
+    return projection
+
+
+def _levels(power: Float[np.ndarray, "*cells"]) -> Float[np.ndarray, "*cells"]:
+    """Converts released powers to float32 levels."""
+    return to_log_scale(power.astype(np.float32) * np.float32(POWER_UNIT))
+
+
+def _add_doppler(
+    projection: Float[np.ndarray, "r A DE"],
+    beams: Int[np.ndarray, "..."],
+    levels: Float[np.ndarray, "*cells"],
+    doppler: Float[np.ndarray, "*cells"],
+    grid: RadarGrid,
+) -> None:
+    """Raises the Doppler half of a projection to the levels of cells, in place.
+
+    Args:
+        projection: C-contiguous rows of a projection.
+        beams: Positions of the cells among the range-azimuth bins of `projection`.
+        levels: Levels of the cells.
+        doppler: Mean Doppler of the cells.
+        grid: Axes of the radar.
+    """
+    if not grid.num_doppler:
+        return
+    first_mps, last = float(grid.doppler_mps[0]), grid.num_doppler - 1
+    scale = last / (float(np.ptp(grid.doppler_mps)) or 1.0)
+    bins = np.rint((doppler.astype(np.float32) - first_mps) * scale)
+    # fmin and fmax also replace NaN, which the release has where the power is 0.
+    bins = np.fmax(np.fmin(bins, last), 0).astype(np.intp)
+    cells = beams * projection.shape[-1] + bins
+    np.maximum.at(projection.reshape(-1), cells.ravel(), levels.ravel())
+
+
+def reduce_tensor(
+    tesseract: Real[np.ndarray, "D R E A"], grid: RadarGrid
+) -> Float[np.ndarray, "2 R A E"]:
+    """Computes a `polar3d` array in float64 from a 4D radar tensor of linear power.
+
+    The steps have the precision of K-Radar's: that of the tensor, and float64 from the
+    product with the Doppler axis on. Cells without power have a mean Doppler of NaN.
+    """
+    doppler_mps, exact_mps = grid.doppler_mps, _KRADAR_DOPPLER_MPS
+    if doppler_mps.shape == exact_mps.shape and np.allclose(
+        doppler_mps, exact_mps, atol=1e-6
+    ):
+        doppler_mps = exact_mps
+    weights = doppler_mps[1:, None, None]
+    polar = np.empty(_polar_shape(grid))
+    for azimuth in range(grid.num_azimuth):
+        column = np.ascontiguousarray(tesseract[1:, :, :, azimuth]) / POWER_UNIT
+        total = column.sum(axis=0)  # [R, E]
+        polar[0, :, azimuth] = total / len(weights)
+        with np.errstate(invalid="ignore"):
+            polar[1, :, azimuth] = (column / total * weights).sum(axis=0)
+    return polar
+
+
+def strongest_points(
+    polar: Float[np.ndarray, "2 R A E"],
+    grid: RadarGrid,
+    rate: float,
+    *,
+    range_wise: bool = False,
+) -> Float[np.ndarray, "N 11"]:
+    """Returns the points of an `rpc` file from a `polar3d` array.
+
+    Args:
+        polar: Mean power and mean Doppler.
+        grid: Axes of the radar.
+        rate: Fraction of the cells that become points, above 0 and below 1.
+        range_wise: Whether to take this fraction of the cells at every range, instead of
+            all cells.
+
+    Raises:
+        UserError: The rate is out of its range.
+    """
+    require(0 < rate < 1, "rate", rate, "a number above 0 and below 1")
+    power, doppler = polar
+    axes = (1, 2) if range_wise else None
+    bins = np.nonzero(power > np.quantile(power, 1 - rate, axis=axes, keepdims=True))
+    r, azimuth, elevation = _polar_of_bins(bins, grid)
+    xyz = _positions(r, azimuth, elevation)
+    columns = (*xyz, power[bins], doppler[bins], r, azimuth, elevation, *bins)
+    return np.stack(columns, axis=1)
+
+
+def _polar_shape(grid: RadarGrid) -> tuple[int, int, int, int]:
+    return 2, grid.num_range, grid.num_azimuth, grid.num_elevation
+
+
+def _polar_of_bins(
+    bins: tuple[Int[np.ndarray, " N"], ...], grid: RadarGrid
+) -> tuple[Float[np.ndarray, " N"], ...]:
+    """Returns range, and azimuth and elevation in the signs of the points."""
+    r, a, e = bins
+    return grid.range_m[r], -grid.azimuth_rad[a], -grid.elevation_rad[e]
+
+
+def _positions(
+    r: Float[np.ndarray, " N"],
+    azimuth: Float[np.ndarray, " N"],
+    elevation: Float[np.ndarray, " N"],
+) -> Float[np.ndarray, "3 N"]:
+    """Returns x, y and z of points in meters."""
+    ground = r * np.cos(elevation)
+    return np.stack(
+        [ground * np.cos(azimuth), ground * np.sin(azimuth), r * np.sin(elevation)]
+    )
+
+
+def _bins_of_points(
+    points: Float[np.ndarray, "N _"], grid: RadarGrid, name: str
+) -> tuple[Int[np.ndarray, " N"], ...]:
+    """Returns range, azimuth and elevation bins, from their columns or from x, y, z."""
+    xyz = points[:, :3].T
+    if points.shape[1] == 11:
+        stored, sizes = points[:, 8:], _polar_shape(grid)[1:]
+        is_bin = (stored == np.rint(stored)) & (stored >= 0) & (stored < sizes)
+        if not is_bin.all():
+            row, axis = np.argwhere(~is_bin)[0]
+            raise DataError(
+                f"{name}: point {row} has {('range', 'azimuth', 'elevation')[axis]} bin "
+                f"{stored[row, axis]:g}, expected an integer from 0 to {sizes[axis] - 1}"
+            )
+        bins = tuple(stored.T.astype(np.intp))
+    else:
+        x, y, z = xyz
+        ground = np.hypot(x, y)
+        polar = np.hypot(ground, z), -np.arctan2(y, x), -np.arctan2(z, ground)
+        axes = grid.range_m, grid.azimuth_rad, grid.elevation_rad
+        bins = tuple(
+            np.searchsorted((axis[1:] + axis[:-1]) / 2, values)
+            for axis, values in zip(axes, polar, strict=True)
+        )
+    offset_m = np.abs(_positions(*_polar_of_bins(bins, grid)) - xyz).max(axis=0)
+    limit_m = np.diff(grid.range_m).min() / 2
+    if not (offset_m <= limit_m).all():
+        row = int(np.argmin(offset_m <= limit_m))
+        raise DataError(
+            f"{name}: point {row} at x, y, z = {np.round(xyz[:, row], 2).tolist()} m does "
+            "not lie at a bin of the radar's grid; expected points of this radar, in "
+            "meters and in the radar frame"
+        )
+    return bins
+
+
+def _check_layout(frame: Real[np.ndarray, "..."], grid: RadarGrid, name: str) -> None:
+    """Raises a `DataError` unless shape and type are those of a reduced release."""
+    shape = frame.shape
+    is_known = shape == _polar_shape(grid) or (
+        frame.ndim == 2 and shape[1] in (5, 11) and shape[0] > 0
+    )
+    if is_known and frame.dtype.kind == "f" and frame.dtype.itemsize >= 4:
+        return
+    if frame.ndim == 2 and shape[1] == 4:
+        raise DataError(
+            f"{name}: points [N, 4] on a Cartesian grid (sprdr) cannot be used, because "
+            "they have neither Doppler nor range, azimuth and elevation bins; download "
+            "rdr_polar_3d or rpc files"
+        )
+    raise DataError(
+        f"{name}: shape {shape} of {frame.dtype}, expected float64 or float32 [power and "
+        f"Doppler, range, azimuth, elevation] = {_polar_shape(grid)}, or points [N, 11] "
+        "or [N, 5]"
+    )
+
+
+def _check_values(
+    power: Float[np.ndarray, "..."],
+    doppler: Float[np.ndarray, "..."],
+    grid: RadarGrid,
+    name: str,
+) -> None:
+    """Raises a `DataError` if power or Doppler are not on the scale of the releases."""
+    low, high, problem = float(power.min()), float(power.max()), None
+    if not 0 <= low <= high < np.inf:
+        problem = "some values are negative (as decibels are), infinite or NaN"
+    elif _DECIBELS[0] < low and high <= _DECIBELS[1]:
+        problem = "they seem to be decibels"
+    elif high > _MAX_POWER:
+        problem = f"they seem not to be divided by {POWER_UNIT:g}"
+    elif low == 0 and (share := np.mean(power == 0)) > MAX_ZERO_SHARE:
+        problem = f"{share:.0%} of the values are exactly 0"
+    if problem:
+        raise DataError(
+            f"{name}: powers from {low:.3g} to {high:.3g}, expected linear power divided "
+            f"by {POWER_UNIT:g}: {problem}"
+        )
+    if not grid.num_doppler:
+        return
+    first, last = grid.doppler_mps[[0, -1]]
+    if not first <= doppler.min() <= doppler.max() <= last:  # also if there are NaN
+        is_wrong = ~((doppler >= first) & (doppler <= last)) & (power > 0)
+        if is_wrong.any():
+            raise DataError(
+                f"{name}: {int(is_wrong.sum())} cells have a mean Doppler outside the "
+                f"radar's axis of {first:.3g} to {last:.3g} m/s, such as "
+                f"{doppler[is_wrong].flat[0]:.3g}"
+            )
