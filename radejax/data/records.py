@@ -50,8 +50,8 @@ class Records:
         shape: Shape of every array.
         dtype: Type of every array: "float16", "float32" or "uint8".
         source: JSON values that describe how the records were created: the radar "grid"
-            for projections; the configuration and weights of the backbone for
-            embeddings.
+            for projections, and the "release" if it is a reduced one; the configuration
+            and weights of the backbone for embeddings.
     """
 
     folder: pathlib.Path
@@ -315,6 +315,8 @@ def preprocess(
     if frames.reader_version is not None:
         name = f"{type(frames).__module__}:{type(frames).__qualname__}"
         source["reader"] = [name, frames.reader_version]
+    if frames.release is not None:
+        source["release"] = frames.release
     records = Records.create(folder, grid.projection_shape, dtype, source)
     keys, mine = records.keys(), list(frames)[index::count]
     if frames.reader_version is not None:

@@ -38,6 +38,11 @@ RELEASES = ("polar3d", "rpc")
 POWER_UNIT = 1e13
 """Released powers are linear power divided by this."""
 
+UNUSABLE_POINTS = (
+    "points [N, 4] on a Cartesian grid (sprdr) cannot be used, because they have neither "
+    "Doppler nor range, azimuth and elevation bins; download rdr_polar_3d or rpc files"
+)
+
 _KRADAR_DOPPLER_MPS = np.linspace(-1.932591218305504, 1.872197742733457, 64)
 """K-Radar's Doppler axis, of which `RadarGrid.kradar` has six decimals."""
 
@@ -61,8 +66,8 @@ def is_reduced(frame: Real[np.ndarray, "..."], grid: RadarGrid) -> bool:
     recognized by the negative values of its Doppler.
     """
     if frame.ndim == 2:
-        return True
-    is_polar = frame.shape == _polar_shape(grid) != grid.shape_drea
+        return frame.shape[1] in (4, 5, 11)  # 4: an error explains why not
+    is_polar = frame.shape == polar_shape(grid) != grid.shape_drea
     is_unique = frame.shape[1:] != grid.projection_shape
     return is_polar and (is_unique or bool(frame[1].min() < 0))
 
@@ -171,7 +176,7 @@ def reduce_tensor(
     ):
         doppler_mps = exact_mps
     weights = doppler_mps[1:, None, None]
-    polar = np.empty(_polar_shape(grid))
+    polar = np.empty(polar_shape(grid))
     for azimuth in range(grid.num_azimuth):
         column = np.ascontiguousarray(tesseract[1:, :, :, azimuth]) / POWER_UNIT
         total = column.sum(axis=0)  # [R, E]
@@ -210,7 +215,8 @@ def strongest_points(
     return np.stack(columns, axis=1)
 
 
-def _polar_shape(grid: RadarGrid) -> tuple[int, int, int, int]:
+def polar_shape(grid: RadarGrid) -> tuple[int, int, int, int]:
+    """Returns the shape of `polar3d` frames: 2, range, azimuth, elevation."""
     return 2, grid.num_range, grid.num_azimuth, grid.num_elevation
 
 
@@ -240,7 +246,7 @@ def _bins_of_points(
     """Returns range, azimuth and elevation bins, from their columns or from x, y, z."""
     xyz = points[:, :3].T
     if points.shape[1] == 11:
-        stored, sizes = points[:, 8:], _polar_shape(grid)[1:]
+        stored, sizes = points[:, 8:], polar_shape(grid)[1:]
         is_bin = (stored == np.rint(stored)) & (stored >= 0) & (stored < sizes)
         if not is_bin.all():
             row, axis = np.argwhere(~is_bin)[0]
@@ -273,20 +279,16 @@ def _bins_of_points(
 def _check_layout(frame: Real[np.ndarray, "..."], grid: RadarGrid, name: str) -> None:
     """Raises a `DataError` unless shape and type are those of a reduced release."""
     shape = frame.shape
-    is_known = shape == _polar_shape(grid) or (
+    is_known = shape == polar_shape(grid) or (
         frame.ndim == 2 and shape[1] in (5, 11) and shape[0] > 0
     )
     if is_known and frame.dtype.kind == "f" and frame.dtype.itemsize >= 4:
         return
     if frame.ndim == 2 and shape[1] == 4:
-        raise DataError(
-            f"{name}: points [N, 4] on a Cartesian grid (sprdr) cannot be used, because "
-            "they have neither Doppler nor range, azimuth and elevation bins; download "
-            "rdr_polar_3d or rpc files"
-        )
+        raise DataError(f"{name}: {UNUSABLE_POINTS}")
     raise DataError(
         f"{name}: shape {shape} of {frame.dtype}, expected float64 or float32 [power and "
-        f"Doppler, range, azimuth, elevation] = {_polar_shape(grid)}, or points [N, 11] "
+        f"Doppler, range, azimuth, elevation] = {polar_shape(grid)}, or points [N, 11] "
         "or [N, 5]"
     )
 

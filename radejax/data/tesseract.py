@@ -38,6 +38,7 @@ from radejax.data.projection import (
     project_columns,
     project_tensor,
 )
+from radejax.data.reduced import is_reduced_file, read_reduced
 from radejax.geometry.radar_grid import RadarGrid
 
 VARIABLE = "arrDREA"
@@ -159,7 +160,10 @@ def _projection_axes(
 
 
 def read_frame(path: PathLike, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
-    """Return the float32 projection of a radar tensor file or a released projection.
+    """Return the float32 projection of a radar tensor, or of a file of another release.
+
+    Files of `.npy` contain projections of the reference implementation or, by their names,
+    frames of K-Radar's reduced releases (see `radejax.data.reduced`).
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -167,6 +171,8 @@ def read_frame(path: PathLike, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
     """
     if pathlib.Path(path).suffix != ".npy":
         return project_file(path, shape_drea=grid.shape_drea)
+    if is_reduced_file(path):
+        return read_reduced(path, grid)
     projection = read_projection_npy(path, projection_shape=grid.projection_shape)
     return projection.astype(np.float32)
 

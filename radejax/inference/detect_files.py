@@ -28,12 +28,13 @@ from radejax.data.kradar import KRadar
 from radejax.data.kradar.conditions import check_weather, read_description
 from radejax.data.kradar.dataset import sequence_number
 from radejax.data.pipeline import camera_inputs
+from radejax.data.reduced import is_reduced_file
 from radejax.evaluation import kitti
 from radejax.geometry.camera import Camera
 from radejax.inference.detector import Detector
 from radejax.inference.saved import Step
 
-PATTERNS = ("tesseract_*.mat", "DERA_tesseract_*.npy")
+PATTERNS = ("tesseract_*.mat", "DERA_tesseract_*.npy", "polar3d_*.npy", "rpc_*.npy")
 """Patterns of the names of radar files."""
 
 
@@ -42,7 +43,7 @@ def find_frames(
     sequence_numbers: Sequence[int] | None = None,
     weather: Sequence[str] | None = None,
 ) -> list[pathlib.Path]:
-    """Find tesseract and projection files in files and folders.
+    """Find radar files in files and folders.
 
     If a frame has both files, only the projection is returned.
 
@@ -87,7 +88,8 @@ def find_frames(
 
 
 def _sequence(path: pathlib.Path) -> pathlib.Path:
-    return path.absolute().parent.parent
+    folder = path.absolute().parent
+    return folder if is_reduced_file(path) else folder.parent
 
 
 def front_images(
@@ -134,7 +136,7 @@ def front_images(
     return {
         path: (frame.camera_path, camera)
         for frame, camera in zip(frames, cameras, strict=True)
-        for path in (frame.tesseract_path, frame.projection_path)
+        for path in {frame.tesseract_path, frame.projection_path, frame.radar_path}
         if path is not None and frame.camera_path is not None and camera.is_valid
     }
 
@@ -329,7 +331,9 @@ def key_of(path: pathlib.Path) -> str:
 
     Only label files contain the LiDAR index.
     """
-    radar = path.stem.removeprefix("DERA_").removeprefix("tesseract_")
+    radar = path.stem
+    for pattern in ("DERA_*", *PATTERNS):
+        radar = radar.removeprefix(pattern.partition("*")[0])
     sequence = _sequence(path).name
     return frame_key(f"{sequence}/{radar}" if sequence else radar)
 

@@ -48,6 +48,7 @@ from radejax.data.kradar.labels import (
     normalize_version,
     read_label_file,
 )
+from radejax.data.reduced import RELEASES, UNUSABLE_POINTS
 from radejax.geometry.camera import KRADAR_RADAR_FROM_LIDAR_Z_M, RADAR_FROM_LIDAR_M
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -84,7 +85,8 @@ class Frame(LabelledFrame):
         visibility: Visibility flags of `boxes`.
         tesseract_path: File of the 4D radar tensor, or None if it is missing.
         projection_path: File of the `.npy` projection of the reference implementation,
-            or None if it is missing. It is the `radar_path` if the tensor is missing.
+            or None if it is missing. It is the `radar_path` if the tensor is missing. In
+            reduced releases, both are None.
     """
 
     header: LabelHeader
@@ -126,12 +128,14 @@ class KRadar(LabelledFrames[Frame]):
         grid: Sensor axes of K-Radar, or of the `radar_grid.json` in a root.
         roots: Folders that contain the sequences.
         folders: Folders of every sequence in the roots, by sequence number.
+        release: Reduced release that the roots contain ("polar3d" or "rpc"), or None.
         is_simulated: Whether the simulator wrote the roots or the labels.
 
     Raises:
         FileNotFoundError: A root or `labels` does not exist.
-        UserError: There are no sequences, labels or labels of the given sequences; an
-            option has an invalid value; or the labels have another version.
+        UserError: There are no sequences, labels or labels of the given sequences; the
+            roots contain several forms of radar data; an option has an invalid value; or
+            the labels have another version.
         DataError: The folders, the labels or the split file are ambiguous or corrupted
             as a whole.
 
@@ -172,6 +176,7 @@ class KRadar(LabelledFrames[Frame]):
 
         roots = self.roots = _as_paths(root)
         self.folders = find_sequences(roots)
+        self.release = find_release(self.folders)
         names = ", ".join(map(str, roots))
         if not self.folders and (roots or labels is None):
             raise UserError(f"no sequence folders (1, 2, ...) in the roots: {names}")
@@ -473,18 +478,23 @@ class KRadar(LabelledFrames[Frame]):
         tesseract = folder.find("radar_tesseract", f"{stem}.mat")
         projection = folder.find("DERA_tesseract", f"DERA_{stem}.npy")
         camera = folder.find("cam-front", f"cam-front_{header.camera_front:05d}.png")
+        kind, wanted = "tesseract", f"radar_tesseract/{stem}.mat"
+        radar = tesseract or projection
+        if self.release is not None:
+            kind, wanted = self.release, f"{self.release}_{header.radar:05d}.npy"
+            radar = folder.find(".", wanted)
         if folder.folders:
-            if not (tesseract or projection):
+            if not radar:
                 self._report(
-                    "tesseract missing",
-                    f"{key[0]}/{key[1]}: no radar_tesseract/{stem}.mat in "
+                    f"{kind} missing",
+                    f"{key[0]}/{key[1]}: no {wanted} in "
                     + ", ".join(map(str, folder.folders)),
                 )
             self.counts["frames without front image"] += camera is None
         return {
             "tesseract_path": tesseract,
             "projection_path": projection,
-            "radar_path": tesseract or projection,
+            "radar_path": radar,
             "camera_path": camera,
         }
 
@@ -553,6 +563,32 @@ def find_sequences(roots: Sequence[pathlib.Path]) -> dict[int, SequenceFolder]:
                     )
                 same.append(folder)
     return {number: SequenceFolder(found[number]) for number in sorted(found)}
+
+
+def find_release(folders: Mapping[int, SequenceFolder]) -> str | None:
+    """Returns the reduced release that the sequences contain, or None without one.
+
+    Raises:
+        UserError: The sequences contain radar data in several forms, or only points of a
+            Cartesian grid.
+    """
+    found: dict[str, pathlib.Path] = {}
+    for folder in folders.values():
+        for name in ("radar_tesseract", "DERA_tesseract", "."):
+            for path in folder.listing(name).values():
+                form = "tensor" if name != "." else path.name.partition("_")[0]
+                if path.suffix in (".mat", ".npy"):
+                    found.setdefault(form, path)
+    forms = [form for form in ("tensor", *RELEASES) if form in found]
+    if len(forms) > 1:
+        first, second = (found[form] for form in forms[:2])
+        raise UserError(
+            f"{first} and {second} are different forms of radar data, which cannot be "
+            "mixed in one dataset: name only roots of one form"
+        )
+    if not forms and "sprdr" in found:
+        raise UserError(f"{found['sprdr']}: {UNUSABLE_POINTS}")
+    return next((form for form in RELEASES if form in found), None)
 
 
 def _first_file(
