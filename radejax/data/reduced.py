@@ -23,25 +23,30 @@ References:
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float, Int, Real
 
 from radejax.core.archives import read_npy
 from radejax.core.errors import DataError, require
-from radejax.core.files import PathLike
+from radejax.core.files import PathLike, as_path
 from radejax.data.projection import MAX_ZERO_SHARE, to_log_scale
 from radejax.geometry.radar_grid import RadarGrid
 
 RELEASES = ("polar3d", "rpc")
 """Reduced releases, by the first part of the names of their files."""
 
+UNUSABLE_POINTS = (
+    "points [N, 4] of a Cartesian grid (sprdr) cannot be used, because they have neither "
+    "Doppler nor range, azimuth and elevation bins; download rdr_polar_3d or rpc files"
+)
+
 POWER_UNIT = 1e13
 """Released powers are linear power divided by this."""
 
-UNUSABLE_POINTS = (
-    "points [N, 4] on a Cartesian grid (sprdr) cannot be used, because they have neither "
-    "Doppler nor range, azimuth and elevation bins; download rdr_polar_3d or rpc files"
-)
+_MAX_POWER = 1e6  # far above any echo divided by POWER_UNIT, far below undivided noise
+_DECIBELS = (20.0, 300.0)  # range of undivided noise and echoes in decibels
 
 _KRADAR_DOPPLER_MPS = np.linspace(-1.932591218305504, 1.872197742733457, 64)
 """K-Radar's Doppler axis, of which `RadarGrid.kradar` has six decimals."""
@@ -49,14 +54,10 @@ _KRADAR_DOPPLER_MPS = np.linspace(-1.932591218305504, 1.872197742733457, 64)
 _ROWS = 16
 """Ranges that are projected at a time, so that they stay in the cache."""
 
-_NAMES = ("polar3d_", "rpc_", "sprdr_")
-_MAX_POWER = 1e6  # far above any echo divided by POWER_UNIT, far below undivided noise
-_DECIBELS = (20.0, 300.0)  # range of undivided noise and echoes in decibels
-
 
 def is_reduced_file(path: PathLike) -> bool:
-    """Returns True if a file has the name of a reduced release's file."""
-    return str(path).rpartition("/")[2].startswith(_NAMES)
+    """Returns True if a file is named like those of the reduced releases."""
+    return as_path(path).name.startswith(("polar3d_", "rpc_", "sprdr_"))
 
 
 def is_reduced(frame: Real[np.ndarray, "..."], grid: RadarGrid) -> bool:
@@ -67,9 +68,14 @@ def is_reduced(frame: Real[np.ndarray, "..."], grid: RadarGrid) -> bool:
     """
     if frame.ndim == 2:
         return frame.shape[1] in (4, 5, 11)  # 4: an error explains why not
-    is_polar = frame.shape == polar_shape(grid) != grid.shape_drea
     is_unique = frame.shape[1:] != grid.projection_shape
+    is_polar = frame.shape == polar_shape(grid) != grid.shape_drea
     return is_polar and (is_unique or bool(frame[1].min() < 0))
+
+
+def polar_shape(grid: RadarGrid) -> tuple[int, int, int, int]:
+    """Returns the shape of `polar3d` frames: 2, range, azimuth, elevation."""
+    return 2, grid.num_range, grid.num_azimuth, grid.num_elevation
 
 
 def read_reduced(path: PathLike, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
@@ -105,61 +111,54 @@ def project_reduced(
     """
     _check_layout(frame, grid, name)
     projection = np.empty(grid.projection_shape, np.float32)
-    elevation = projection[..., grid.num_doppler :]
     if frame.ndim == 2:
         if frame.shape[1] == 5:
-            frame = frame[np.any(frame[:, :3] != 0, axis=1)]
-        power, doppler = frame[:, 3], frame[:, 4]
-        _check_values(power, doppler, grid, name)
-        bins, levels = _bins_of_points(frame, grid, name), _levels(power)
-        projection[...] = levels.min()
-        elevation[bins] = levels
-        _add_doppler(
-            projection, bins[0] * grid.num_azimuth + bins[1], levels, doppler, grid
-        )
+            frame = frame[frame[:, :3].any(axis=1)]
+        _check_values(*frame.T[3:5], grid, name)
+        bins = _bins_of_points(frame, grid, name)
+        beams = bins[0] * grid.num_azimuth + bins[1]
+        _fill(projection, bins, beams, *frame.T[3:5], grid)
         return projection
-    power, doppler = frame
-    _check_values(power, doppler, grid, name)
+    _check_values(*frame, grid, name)
     beams = np.arange(_ROWS * grid.num_azimuth).reshape(_ROWS, -1, 1)
     for start in range(0, grid.num_range, _ROWS):
-        rows = slice(start, start + _ROWS)
-        levels, part = _levels(power[rows]), projection[rows]
-        elevation[rows] = levels
-        part[..., : grid.num_doppler] = levels.min(axis=-1, keepdims=True)
-        _add_doppler(part, beams[: len(part)], levels, doppler[rows], grid)
+        power, doppler = frame[:, start : start + _ROWS]
+        part = projection[start : start + _ROWS]
+        _fill(part, ..., beams[: len(part)], power, doppler, grid)
     return projection
 
 
-def _levels(power: Float[np.ndarray, "*cells"]) -> Float[np.ndarray, "*cells"]:
-    """Converts released powers to float32 levels."""
-    return to_log_scale(power.astype(np.float32) * np.float32(POWER_UNIT))
-
-
-def _add_doppler(
+def _fill(
     projection: Float[np.ndarray, "r A DE"],
+    bins: Any,
     beams: Int[np.ndarray, "..."],
-    levels: Float[np.ndarray, "*cells"],
+    power: Float[np.ndarray, "*cells"],
     doppler: Float[np.ndarray, "*cells"],
     grid: RadarGrid,
 ) -> None:
-    """Raises the Doppler half of a projection to the levels of cells, in place.
+    """Computes rows of a projection from cells.
 
     Args:
-        projection: C-contiguous rows of a projection.
-        beams: Positions of the cells among the range-azimuth bins of `projection`.
-        levels: Levels of the cells.
+        projection: C-contiguous rows to write.
+        bins: Index of the cells in the elevation half of the rows.
+        beams: Positions of the cells among the range-azimuth bins of the rows.
+        power: Power of the cells in `POWER_UNIT`.
         doppler: Mean Doppler of the cells.
         grid: Axes of the radar.
     """
+    levels = to_log_scale(power.astype(np.float32) * np.float32(POWER_UNIT))
+    # The lowest level over elevation; for points, that of the weakest.
+    projection[...] = levels.min(axis=-1, keepdims=True)
+    projection[..., grid.num_doppler :][bins] = levels
     if not grid.num_doppler:
         return
     first_mps, last = float(grid.doppler_mps[0]), grid.num_doppler - 1
     scale = last / (float(np.ptp(grid.doppler_mps)) or 1.0)
-    bins = np.rint((doppler.astype(np.float32) - first_mps) * scale)
+    channels = np.rint((doppler.astype(np.float32) - first_mps) * scale)
     # fmin and fmax also replace NaN, which the release has where the power is 0.
-    bins = np.fmax(np.fmin(bins, last), 0).astype(np.intp)
-    cells = beams * projection.shape[-1] + bins
-    np.maximum.at(projection.reshape(-1), cells.ravel(), levels.ravel())
+    channels = np.fmax(np.fmin(channels, last), 0).astype(np.intp)
+    cells = (beams * projection.shape[-1] + channels).ravel()
+    np.maximum.at(projection.reshape(-1), cells, levels.ravel())
 
 
 def reduce_tensor(
@@ -170,12 +169,10 @@ def reduce_tensor(
     The steps have the precision of K-Radar's: that of the tensor, and float64 from the
     product with the Doppler axis on. Cells without power have a mean Doppler of NaN.
     """
-    doppler_mps, exact_mps = grid.doppler_mps, _KRADAR_DOPPLER_MPS
-    if doppler_mps.shape == exact_mps.shape and np.allclose(
-        doppler_mps, exact_mps, atol=1e-6
-    ):
-        doppler_mps = exact_mps
-    weights = doppler_mps[1:, None, None]
+    weights, exact = grid.doppler_mps, _KRADAR_DOPPLER_MPS
+    if weights.shape == exact.shape and np.allclose(weights, exact, atol=1e-6):
+        weights = exact
+    weights = weights[1:, None, None]
     polar = np.empty(polar_shape(grid))
     for azimuth in range(grid.num_azimuth):
         column = np.ascontiguousarray(tesseract[1:, :, :, azimuth]) / POWER_UNIT
@@ -209,42 +206,27 @@ def strongest_points(
     power, doppler = polar
     axes = (1, 2) if range_wise else None
     bins = np.nonzero(power > np.quantile(power, 1 - rate, axis=axes, keepdims=True))
-    r, azimuth, elevation = _polar_of_bins(bins, grid)
-    xyz = _positions(r, azimuth, elevation)
-    columns = (*xyz, power[bins], doppler[bins], r, azimuth, elevation, *bins)
-    return np.stack(columns, axis=1)
+    x, y, z, *angles = _points_at(bins, grid)
+    return np.stack([x, y, z, power[bins], doppler[bins], *angles, *bins], axis=1)
 
 
-def polar_shape(grid: RadarGrid) -> tuple[int, int, int, int]:
-    """Returns the shape of `polar3d` frames: 2, range, azimuth, elevation."""
-    return 2, grid.num_range, grid.num_azimuth, grid.num_elevation
-
-
-def _polar_of_bins(
-    bins: tuple[Int[np.ndarray, " N"], ...], grid: RadarGrid
-) -> tuple[Float[np.ndarray, " N"], ...]:
-    """Returns range, and azimuth and elevation in the signs of the points."""
-    r, a, e = bins
-    return grid.range_m[r], -grid.azimuth_rad[a], -grid.elevation_rad[e]
-
-
-def _positions(
-    r: Float[np.ndarray, " N"],
-    azimuth: Float[np.ndarray, " N"],
-    elevation: Float[np.ndarray, " N"],
-) -> Float[np.ndarray, "3 N"]:
-    """Returns x, y and z of points in meters."""
-    ground = r * np.cos(elevation)
-    return np.stack(
-        [ground * np.cos(azimuth), ground * np.sin(azimuth), r * np.sin(elevation)]
+def _points_at(bins: Any, grid: RadarGrid) -> Float[np.ndarray, "6 N"]:
+    """Returns x, y, z, range, azimuth and elevation of bins, in the signs of points."""
+    r, azimuth, elevation = (
+        grid.range_m[bins[0]],
+        -grid.azimuth_rad[bins[1]],
+        -grid.elevation_rad[bins[2]],
     )
+    ground = r * np.cos(elevation)
+    xyz = ground * np.cos(azimuth), ground * np.sin(azimuth), r * np.sin(elevation)
+    return np.stack([*xyz, r, azimuth, elevation])
 
 
 def _bins_of_points(
     points: Float[np.ndarray, "N _"], grid: RadarGrid, name: str
 ) -> tuple[Int[np.ndarray, " N"], ...]:
     """Returns range, azimuth and elevation bins, from their columns or from x, y, z."""
-    xyz = points[:, :3].T
+    x, y, z = xyz = points[:, :3].T
     if points.shape[1] == 11:
         stored, sizes = points[:, 8:], polar_shape(grid)[1:]
         is_bin = (stored == np.rint(stored)) & (stored >= 0) & (stored < sizes)
@@ -256,7 +238,6 @@ def _bins_of_points(
             )
         bins = tuple(stored.T.astype(np.intp))
     else:
-        x, y, z = xyz
         ground = np.hypot(x, y)
         polar = np.hypot(ground, z), -np.arctan2(y, x), -np.arctan2(z, ground)
         axes = grid.range_m, grid.azimuth_rad, grid.elevation_rad
@@ -264,33 +245,30 @@ def _bins_of_points(
             np.searchsorted((axis[1:] + axis[:-1]) / 2, values)
             for axis, values in zip(axes, polar, strict=True)
         )
-    offset_m = np.abs(_positions(*_polar_of_bins(bins, grid)) - xyz).max(axis=0)
-    limit_m = np.diff(grid.range_m).min() / 2
-    if not (offset_m <= limit_m).all():
-        row = int(np.argmin(offset_m <= limit_m))
+    is_near = (
+        np.abs(_points_at(bins, grid)[:3] - xyz) <= np.diff(grid.range_m).min() / 2
+    )
+    if not is_near.all():
+        row = np.argwhere(~is_near.all(axis=0))[0, 0]
         raise DataError(
             f"{name}: point {row} at x, y, z = {np.round(xyz[:, row], 2).tolist()} m does "
-            "not lie at a bin of the radar's grid; expected points of this radar, in "
-            "meters and in the radar frame"
+            "not lie at a bin of the radar's grid; expected points of this radar, in meters"
         )
     return bins
 
 
 def _check_layout(frame: Real[np.ndarray, "..."], grid: RadarGrid, name: str) -> None:
     """Raises a `DataError` unless shape and type are those of a reduced release."""
-    shape = frame.shape
-    is_known = shape == polar_shape(grid) or (
-        frame.ndim == 2 and shape[1] in (5, 11) and shape[0] > 0
-    )
-    if is_known and frame.dtype.kind == "f" and frame.dtype.itemsize >= 4:
-        return
-    if frame.ndim == 2 and shape[1] == 4:
+    columns = frame.shape[1] if frame.ndim == 2 and len(frame) else None
+    if columns == 4:
         raise DataError(f"{name}: {UNUSABLE_POINTS}")
-    raise DataError(
-        f"{name}: shape {shape} of {frame.dtype}, expected float64 or float32 [power and "
-        f"Doppler, range, azimuth, elevation] = {polar_shape(grid)}, or points [N, 11] "
-        "or [N, 5]"
-    )
+    is_known = columns in (5, 11) or frame.shape == polar_shape(grid)
+    if not is_known or frame.dtype.kind != "f" or frame.dtype.itemsize < 4:
+        raise DataError(
+            f"{name}: shape {frame.shape} of {frame.dtype}, expected float64 or float32 "
+            "[power and Doppler, range, azimuth, elevation] = "
+            f"{polar_shape(grid)}, or points [N, 11] or [N, 5]"
+        )
 
 
 def _check_values(
@@ -301,27 +279,19 @@ def _check_values(
 ) -> None:
     """Raises a `DataError` if power or Doppler are not on the scale of the releases."""
     low, high, problem = float(power.min()), float(power.max()), None
+    first, last = grid.doppler_mps[[0, -1]] if grid.num_doppler else (-np.inf, np.inf)
     if not 0 <= low <= high < np.inf:
-        problem = "some values are negative (as decibels are), infinite or NaN"
+        problem = "some powers are negative (as decibels are), infinite or NaN"
     elif _DECIBELS[0] < low and high <= _DECIBELS[1]:
-        problem = "they seem to be decibels"
+        problem = "the powers seem to be decibels"
     elif high > _MAX_POWER:
-        problem = f"they seem not to be divided by {POWER_UNIT:g}"
+        problem = f"the powers seem not to be divided by {POWER_UNIT:g}"
     elif low == 0 and (share := np.mean(power == 0)) > MAX_ZERO_SHARE:
-        problem = f"{share:.0%} of the values are exactly 0"
+        problem = f"{share:.0%} of the powers are exactly 0"
+    elif not (((doppler >= first) & (doppler <= last)) | (power == 0)).all():
+        problem = f"Doppler outside the radar's axis of {first:.3g} to {last:.3g} m/s"
     if problem:
         raise DataError(
             f"{name}: powers from {low:.3g} to {high:.3g}, expected linear power divided "
-            f"by {POWER_UNIT:g}: {problem}"
+            f"by {POWER_UNIT:g}, and mean Doppler in m/s: {problem}"
         )
-    if not grid.num_doppler:
-        return
-    first, last = grid.doppler_mps[[0, -1]]
-    if not first <= doppler.min() <= doppler.max() <= last:  # also if there are NaN
-        is_wrong = ~((doppler >= first) & (doppler <= last)) & (power > 0)
-        if is_wrong.any():
-            raise DataError(
-                f"{name}: {int(is_wrong.sum())} cells have a mean Doppler outside the "
-                f"radar's axis of {first:.3g} to {last:.3g} m/s, such as "
-                f"{doppler[is_wrong].flat[0]:.3g}"
-            )

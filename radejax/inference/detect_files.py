@@ -136,7 +136,7 @@ def front_images(
     return {
         path: (frame.camera_path, camera)
         for frame, camera in zip(frames, cameras, strict=True)
-        for path in {frame.tesseract_path, frame.projection_path, frame.radar_path}
+        for path in (frame.tesseract_path, frame.projection_path)
         if path is not None and frame.camera_path is not None and camera.is_valid
     }
 

@@ -458,10 +458,10 @@ def radar_batch(frames: Frames, grid: RadarGrid) -> Real[Any, "B ..."]:
 def _projected(frames: Any, grid: RadarGrid) -> Any:
     """Convert an array to numbers, and frames of a reduced release to projections."""
     array = as_numbers(frames, "frames")
-    if np.shape(array)[1:] == polar_shape(grid) != grid.shape_drea and len(array):
-        return np.stack([project_reduced(np.asarray(x), grid) for x in array])
     if is_reduced(array, grid):
         return project_reduced(np.asarray(array), grid)
+    if array.shape[1:] == polar_shape(grid) != grid.shape_drea and len(array):
+        return np.stack([project_reduced(np.asarray(x), grid) for x in array])
     return array
 
 

@@ -19,10 +19,11 @@ from radejax.core.structures import CLASSES, RARE_SHARE
 from radejax.data.dataset import Summary
 from radejax.data.kradar.conditions import KRADAR_CONDITIONS, UNKNOWN_CONDITIONS
 from radejax.data.kradar.dataset import Frame, KRadar, SequenceFolder, read_calibration
-from radejax.data.reduced import RELEASES, check_reduced, read_reduced
+from radejax.data.reduced import check_reduced, is_reduced_file
 from radejax.data.tesseract import (
     check_projection_npy,
     check_tesseract,
+    read_frame,
     read_projection_npy,
 )
 from radejax.geometry.radar_grid import RadarGrid
@@ -141,30 +142,26 @@ def check_dataset(
     tensors = [
         (number, path)
         for number, folder in folders.items()
-        for path in [*_tensors(folder), *_projections(folder), *_reduced(folder)]
+        for path in [*_tensors(folder), *_projections(folder)]
     ]
     corrupted: collections.Counter[int] = collections.Counter()
-    grid, kind_of = (
-        data.grid,
-        {".mat": "tesseract", ".npy": data.release or "projection"},
-    )
+    grid = data.grid
     for number, path in tqdm(tensors, "check", unit="file", disable=not progress):
         try:
             if path.suffix == ".mat":
                 check_tesseract(path, shape_drea=grid.shape_drea, deep=deep)
-            elif data.release is not None:
-                (read_reduced if deep else check_reduced)(path, grid)
+            elif is_reduced_file(path):
+                (read_frame if deep else check_reduced)(path, grid)
             elif deep:
                 read_projection_npy(path, projection_shape=grid.projection_shape)
             else:
                 check_projection_npy(path, grid.projection_shape)
         except DataError as error:
-            kind = kind_of[path.suffix]
+            kind = "tesseract" if path.suffix == ".mat" else "projection"
             summary.problems.append((f"{kind} corrupted", str(error)))
-            corrupted[number] += kind != "projection"
+            corrupted[number] += kind == "tesseract"
         except OSError as error:
-            kind = data.release or "tesseract"
-            summary.problems.append((f"{kind} not readable", str(error)))
+            summary.problems.append(("tesseract not readable", str(error)))
     is_kradar = data.grid.shape_drea == RadarGrid.kradar().shape_drea
     rows = []
     for number, folder in folders.items():
@@ -172,10 +169,8 @@ def check_dataset(
         _check_calibration(folder, own, summary)
         if is_kradar:
             _check_conditions(number, own, summary)
-        row = _row(number, folder, own, splits, data.release)
-        rows.append(
-            row | {f"{data.release or 'tesseracts'}_corrupted": corrupted[number]}
-        )
+        row = _row(number, folder, own, splits)
+        rows.append(row | {"tesseracts_corrupted": corrupted[number]})
     names = [str(path) for path in data.roots]
     return HealthReport(
         names, data.version, rows, _count_objects(data, splits), summary
@@ -188,14 +183,8 @@ def _tensors(folder: SequenceFolder) -> list[pathlib.Path]:
 
 
 def _projections(folder: SequenceFolder) -> list[pathlib.Path]:
-    files = folder.listing("DERA_tesseract").values()
-    return [path for path in files if path.suffix == ".npy"]
-
-
-def _reduced(folder: SequenceFolder) -> list[pathlib.Path]:
-    files = folder.listing(".").items()
-    names = tuple(f"{release}_" for release in RELEASES)
-    return [path for name, path in files if name.startswith(names)]
+    files = folder.listing("DERA_tesseract") | folder.listing(".")
+    return [path for path in files.values() if path.suffix == ".npy"]
 
 
 def _row(
@@ -203,16 +192,8 @@ def _row(
     folder: SequenceFolder,
     frames: Sequence[Frame],
     splits: Mapping[str, str],
-    release: str | None,
 ) -> dict[str, Any]:
     """Returns the table row of one sequence."""
-    radar = {
-        "tesseracts": len(_tensors(folder)),
-        "tesseracts_missing": sum(frame.tesseract_path is None for frame in frames),
-    }
-    if release is not None:
-        missing = sum(frame.radar_path is None for frame in frames)
-        radar = {release: len(_reduced(folder)), f"{release}_missing": missing}
     conditions = KRADAR_CONDITIONS.get(number, UNKNOWN_CONDITIONS)._asdict()
     calibration = "unknown"
     if frames:
@@ -229,7 +210,8 @@ def _row(
         "images": len(folder.listing("cam-front")),
         "images_missing": sum(frame.camera_path is None for frame in frames),
         "calibration": calibration,
-        **radar,
+        "tesseracts": len(_tensors(folder)),
+        "tesseracts_missing": sum(frame.tesseract_path is None for frame in frames),
     }
 
 

@@ -85,8 +85,8 @@ class Frame(LabelledFrame):
         visibility: Visibility flags of `boxes`.
         tesseract_path: File of the 4D radar tensor, or None if it is missing.
         projection_path: File of the `.npy` projection of the reference implementation,
-            or None if it is missing. It is the `radar_path` if the tensor is missing. In
-            reduced releases, both are None.
+            or of a reduced release, or None if it is missing. It is the `radar_path` if
+            the tensor is missing.
     """
 
     header: LabelHeader
@@ -477,16 +477,15 @@ class KRadar(LabelledFrames[Frame]):
         stem = f"tesseract_{header.radar:05d}"
         tesseract = folder.find("radar_tesseract", f"{stem}.mat")
         projection = folder.find("DERA_tesseract", f"DERA_{stem}.npy")
-        camera = folder.find("cam-front", f"cam-front_{header.camera_front:05d}.png")
-        kind, wanted = "tesseract", f"radar_tesseract/{stem}.mat"
-        radar = tesseract or projection
+        wanted = f"radar_tesseract/{stem}.mat"
         if self.release is not None:
-            kind, wanted = self.release, f"{self.release}_{header.radar:05d}.npy"
-            radar = folder.find(".", wanted)
+            wanted = f"{self.release}_{header.radar:05d}.npy"
+            projection = folder.find(".", wanted)
+        camera = folder.find("cam-front", f"cam-front_{header.camera_front:05d}.png")
         if folder.folders:
-            if not radar:
+            if not (tesseract or projection):
                 self._report(
-                    f"{kind} missing",
+                    "tesseract missing",
                     f"{key[0]}/{key[1]}: no {wanted} in "
                     + ", ".join(map(str, folder.folders)),
                 )
@@ -494,7 +493,7 @@ class KRadar(LabelledFrames[Frame]):
         return {
             "tesseract_path": tesseract,
             "projection_path": projection,
-            "radar_path": radar,
+            "radar_path": tesseract or projection,
             "camera_path": camera,
         }
 
@@ -576,15 +575,14 @@ def find_release(folders: Mapping[int, SequenceFolder]) -> str | None:
     for folder in folders.values():
         for name in ("radar_tesseract", "DERA_tesseract", "."):
             for path in folder.listing(name).values():
-                form = "tensor" if name != "." else path.name.partition("_")[0]
                 if path.suffix in (".mat", ".npy"):
+                    form = path.name.partition("_")[0] if name == "." else "tesseract"
                     found.setdefault(form, path)
-    forms = [form for form in ("tensor", *RELEASES) if form in found]
+    forms = [form for form in ("tesseract", *RELEASES) if form in found]
     if len(forms) > 1:
-        first, second = (found[form] for form in forms[:2])
         raise UserError(
-            f"{first} and {second} are different forms of radar data, which cannot be "
-            "mixed in one dataset: name only roots of one form"
+            f"{found[forms[0]]} and {found[forms[1]]} are different forms of radar data, "
+            "which cannot be mixed in one dataset: name only roots of one form"
         )
     if not forms and "sprdr" in found:
         raise UserError(f"{found['sprdr']}: {UNUSABLE_POINTS}")
