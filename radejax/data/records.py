@@ -348,12 +348,12 @@ def _file_of(frame: LabelledFrame) -> list[Any] | None:
 
 def _warn_of_changes(records: Records, frames: FrameSequence) -> None:
     """Logs which records are used and which of their radar files have changed since."""
-    found = (
-        (f.key, _file_of(f), records.path(f.key).with_suffix(".json")) for f in frames
-    )
-    changed = [
-        key for key, file, path in found if file and files.read_json(path) != file
-    ]
+
+    def is_changed(frame: LabelledFrame) -> bool:
+        file, stored = _file_of(frame), records.path(frame.key).with_suffix(".json")
+        return file is not None and files.read_json(stored) != file
+
+    changed = [frame.key for frame in frames if is_changed(frame)]
     _log.info("%d records in %s are used", len(frames), records.folder)
     if changed:
         _log.warning(

@@ -227,34 +227,28 @@ def _bins_of_points(
 ) -> tuple[Int[np.ndarray, " N"], ...]:
     """Returns range, azimuth and elevation bins, from their columns or from x, y, z."""
     x, y, z = xyz = points[:, :3].T
+    axes = grid.range_m, grid.azimuth_rad, grid.elevation_rad
+    sizes = np.reshape([axis.size for axis in axes], (3, 1))
     if points.shape[1] == 11:
-        stored, sizes = points[:, 8:], polar_shape(grid)[1:]
-        is_bin = (stored == np.rint(stored)) & (stored >= 0) & (stored < sizes)
-        if not is_bin.all():
-            row, axis = np.argwhere(~is_bin)[0]
-            raise DataError(
-                f"{name}: point {row} has {('range', 'azimuth', 'elevation')[axis]} bin "
-                f"{stored[row, axis]:g}, expected an integer from 0 to {sizes[axis] - 1}"
-            )
-        bins = tuple(stored.T.astype(np.intp))
+        stored = points[:, 8:].T
     else:
         ground = np.hypot(x, y)
         polar = np.hypot(ground, z), -np.arctan2(y, x), -np.arctan2(z, ground)
-        axes = grid.range_m, grid.azimuth_rad, grid.elevation_rad
-        bins = tuple(
+        stored = [
             np.searchsorted((axis[1:] + axis[:-1]) / 2, values)
             for axis, values in zip(axes, polar, strict=True)
-        )
-    is_near = (
-        np.abs(_points_at(bins, grid)[:3] - xyz) <= np.diff(grid.range_m).min() / 2
-    )
-    if not is_near.all():
-        row = np.argwhere(~is_near.all(axis=0))[0, 0]
+        ]
+    # NaN becomes bin 0. Then, as for bins outside the grid, the position is another one.
+    bins = np.nan_to_num(np.clip(stored, 0, sizes - 1)).astype(np.intp)
+    is_far = ~(np.abs(_points_at(bins, grid)[:3] - xyz) <= np.diff(axes[0]).min() / 2)
+    if (is_wrong := is_far.any(axis=0) | (bins != stored).any(axis=0)).any():
+        row = int(is_wrong.argmax())
         raise DataError(
-            f"{name}: point {row} at x, y, z = {np.round(xyz[:, row], 2).tolist()} m does "
-            "not lie at a bin of the radar's grid; expected points of this radar, in meters"
+            f"{name}: point {row} has x, y, z = {xyz[:, row].round(2).tolist()} m and bins "
+            f"{np.asarray(stored)[:, row].tolist()}, which is not a point on the radar's "
+            f"grid of {' x '.join(map(str, sizes.ravel()))} bins (range, azimuth, elevation)"
         )
-    return bins
+    return tuple(bins)
 
 
 def _check_layout(frame: Real[np.ndarray, "..."], grid: RadarGrid, name: str) -> None:

@@ -38,7 +38,7 @@ from radejax.data.projection import (
     project_columns,
     project_tensor,
 )
-from radejax.data.reduced import is_reduced_file, read_reduced
+from radejax.data.reduced import check_reduced, is_reduced_file, read_reduced
 from radejax.geometry.radar_grid import RadarGrid
 
 VARIABLE = "arrDREA"
@@ -86,23 +86,6 @@ def project_file(
     return projection
 
 
-def check_tesseract(
-    path: PathLike,
-    *,
-    shape_drea: tuple[int, ...] | None = None,
-    deep: bool = False,
-) -> None:
-    """Raise the errors of `project_file` that header and size of a file show.
-
-    With `deep`, the file is read and projected, which also detects corrupted values.
-    """
-    if deep:
-        project_file(path, shape_drea=shape_drea)
-    else:
-        with _opened(path, shape_drea):
-            pass
-
-
 def read_projection_npy(
     path: PathLike, *, projection_shape: tuple[int, ...] | None = None
 ) -> Float[np.ndarray, "R A DE"]:
@@ -132,11 +115,6 @@ def read_projection_npy(
     if (share := np.mean(stored == 0)) > MAX_ZERO_SHARE:
         raise DataError(f"{path}: corrupted, {share:.0%} of the values are exactly 0")
     return np.ascontiguousarray(stored.transpose(axes))
-
-
-def check_projection_npy(path: PathLike, projection_shape: tuple[int, ...]) -> None:
-    """Raise the errors of `read_projection_npy` that header and size of a file show."""
-    _projection_axes(path, read_npy(path, mapped=True), projection_shape)
 
 
 def _projection_axes(
@@ -175,6 +153,22 @@ def read_frame(path: PathLike, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
         return read_reduced(path, grid)
     projection = read_projection_npy(path, projection_shape=grid.projection_shape)
     return projection.astype(np.float32)
+
+
+def check_frame(path: PathLike, grid: RadarGrid, *, deep: bool = False) -> None:
+    """Raise the errors of `read_frame` that header and size of a file show.
+
+    With `deep`, the whole file is read, which also detects corrupted values.
+    """
+    if deep:
+        read_frame(path, grid)
+    elif is_reduced_file(path):
+        check_reduced(path, grid)
+    elif pathlib.Path(path).suffix == ".npy":
+        _projection_axes(path, read_npy(path, mapped=True), grid.projection_shape)
+    else:
+        with _opened(path, grid.shape_drea):
+            pass
 
 
 @contextlib.contextmanager

@@ -9,7 +9,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import importlib.util
-import io
 import itertools
 import json
 import os
@@ -314,11 +313,10 @@ def _write_table(path: pathlib.Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Write boxes as CSV or Parquet, atomically."""
     columns = ("frame", "cls", "score", *BOX_FIELDS)
     if path.suffix == ".csv":
-        text = io.StringIO()
-        table = csv.DictWriter(text, columns, lineterminator="\n")
-        table.writeheader()
-        table.writerows(rows)
-        files.write_text(path, text.getvalue())
+        with files.atomic_path(path) as temporary, open(temporary, "w") as file:
+            table = csv.DictWriter(file, columns, lineterminator="\n")
+            table.writeheader()
+            table.writerows(rows)
         return
     import pandas as pd  # an optional dependency
 

@@ -11,7 +11,7 @@ import json
 import logging
 import pathlib
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -53,43 +53,7 @@ INPUTS = ("projection", "tensor")
 
 RESULTS = ("boxes", "scores", "classes", "is_valid", "num_truncated")
 
-_README = """---
-library_name: radejax
-pipeline_tag: object-detection
-tags: [radar, 4d-radar, 3d-object-detection, k-radar, jax, flax]
----
-
-# {name}: 3D object detection in 4D radar tensors
-
-- Classes: {classes}
-- Use: `radejax.Detector.from_workdir(folder)`; docs/deploy.md of radejax has other ways
-- Left out: {left_out}
-- {origin}
-
-## Input
-
-{input}
-
-For linear power p of a radar tensor [Doppler, range, elevation, azimuth], the projection is
-(10 log10(p + 1e-10) + 1.2) / 184.3, first of the maximum over elevation (Doppler channels), then
-of the maximum over Doppler (elevation channels). Azimuth bin 0 is the leftmost.
-
-Programs were exported with radejax {radejax} and JAX {jax}. `inputs.json` and `outputs.json` list
-their arrays by index. The thresholds of the config are in `config.decode` of `config.json`; a
-region of null there means no limit.
-
-## Output
-
-Boxes [B, {count}, 7]: x (ahead), y (left), z (up) of the center, length, width and height in
-meters, and yaw in radians, counter-clockwise from x, in the frame of the radar, with z from the
-LiDAR. Scores are sigmoids, classes indices into the list above, and `is_valid` is true for a
-detection; other rows are padding. Programs contain network, decoding (maxima of 3 x 3 bins, score
-threshold) and rotated NMS, but no check of the values: NaN gives no detections.
-
-`network.onnx` ends before the decoding. Its `heatmap_logits` [B, R, A, C] become scores by a
-sigmoid. Its `box_params` [B, R, A, 8] are dx and dy from the center of the bin to that of the
-box, z, length, width, height in meters, sin yaw and cos yaw.
-"""
+_MODEL_CARD = pathlib.Path(__file__).with_name("model_card.md")
 _LEFT_OUT = (
     "the frozen DINOv3 weights, whose license restricts redistribution: download them "
     "from their owner and pass `image_backbone=FOLDER`"
@@ -180,7 +144,7 @@ def _readme(detector: Detector, is_tensor: bool, left_out: Sequence[str]) -> str
         radar = f"Power [B, {', '.join(map(str, grid.shape_drea))}] float32 of radar tensors"
     config = detector.saved.config
     is_simulated = (config.get("simulation") or {}).get("scenes") == "procedural"
-    return _README.format(
+    return _MODEL_CARD.read_text().format(
         name={"radenet": "RADE-Net", "dinorade": "DinoRADE"}[config.model.name],
         classes=", ".join(detector.classes),
         input=f"{radar}, B frames.",
@@ -250,7 +214,7 @@ _UNITS = {
 }
 
 
-def _described(names: Sequence[str], arrays: Sequence[Any]) -> bytes:
+def _described(arrays: Iterable[tuple[str, Any]]) -> bytes:
     """Return a list of the inputs or outputs of a program as JSON, null for any size."""
     rows = [
         {
@@ -260,7 +224,7 @@ def _described(names: Sequence[str], arrays: Sequence[Any]) -> bytes:
             "dtype": str(x.dtype),
             "unit": _UNITS.get(name, "weights: the tensor in model.safetensors"),
         }
-        for index, (name, x) in enumerate(zip(names, arrays, strict=True))
+        for index, (name, x) in enumerate(arrays)
     ]
     return json.dumps(rows, indent=1).encode()
 
@@ -309,8 +273,8 @@ def _stablehlo(
     used = [(names[i], exported.in_avals[i]) for i in kept]
     contents = {
         PROGRAM_FILE: bytes(exported.serialize()),
-        INPUTS_FILE: _described(*zip(*used, strict=True)),
-        OUTPUTS_FILE: _described(sorted(RESULTS), exported.out_avals),
+        INPUTS_FILE: _described(used),
+        OUTPUTS_FILE: _described(zip(sorted(RESULTS), exported.out_avals, strict=True)),
     }
     if batch_size and len(platforms) == 1:
         contents[BYTECODE_FILE] = exported.mlir_module_serialized
@@ -348,37 +312,34 @@ def _onnx_files(
         detector = Detector(dataclasses.replace(detector.saved, config=config))
     variables, shapes = _exported(detector, shape, batch_size, with_backbone)
     leaves, tree = jax.tree.flatten(shapes)
-    names = _names(shapes)
+    inputs = dict(zip(_names(shapes), leaves, strict=True))
+    settings = {name: _array(*shape) for name, shape in SETTINGS.items()}
 
     def network(*arrays: jax.Array) -> list[jax.Array]:
         radar, *rest = jax.tree.unflatten(tree, arrays)
         camera = [rest[0], Camera(**rest[1])] if rest else []
         projection = project_jax(radar) if radar.ndim == 5 else to_float(radar)
-        inputs = projection, *camera
-        maps: Any = detector.model.apply(variables, *inputs, train=False)
+        maps: Any = detector.model.apply(variables, projection, *camera, train=False)
         return [maps.heatmap_logits, maps.box_params]
 
     def program(*arrays: jax.Array) -> list[jax.Array]:
-        inputs = jax.tree.unflatten(tree, arrays[: len(leaves)])
-        found = _detect(detector, variables, inputs, arrays[len(leaves) :])
+        given = jax.tree.unflatten(tree, arrays[: len(leaves)])
+        found = _detect(detector, variables, given, arrays[len(leaves) :])
         return list(found.values())
 
-    def convert(function: Any, extra: Mapping[str, Any], results: Any) -> bytes:
-        given = leaves + [_array(*shape) for shape in extra.values()]
-        outputs = list(results)
-        model = to_onnx(
-            function, given, input_names=[*names, *extra], output_names=outputs
-        )
-        return model.SerializeToString()
+    def convert(function: Any, given: Mapping[str, Any], results: Any) -> bytes:
+        names = {"input_names": list(given), "output_names": list(results)}
+        return to_onnx(function, list(given.values()), **names).SerializeToString()
 
-    arguments = [*leaves, *(_array(*shape) for shape in SETTINGS.values())]
+    every = inputs | settings
+    outputs = jax.eval_shape(program, *every.values())
     # onnx_ir warns of every shape that is not static.
     logging.getLogger("onnx_ir").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Explicitly requested dtype float64")
         return {
-            "network.onnx": convert(network, {}, ("heatmap_logits", "box_params")),
-            "detector.onnx": convert(program, SETTINGS, RESULTS),
-            INPUTS_FILE: _described([*names, *SETTINGS], arguments),
-            OUTPUTS_FILE: _described(RESULTS, jax.eval_shape(program, *arguments)),
+            "network.onnx": convert(network, inputs, ("heatmap_logits", "box_params")),
+            "detector.onnx": convert(program, every, RESULTS),
+            INPUTS_FILE: _described(every.items()),
+            OUTPUTS_FILE: _described(zip(RESULTS, outputs, strict=True)),
         }

@@ -103,7 +103,7 @@ def write_recording(scenes: Iterable[Scene], path: str | os.PathLike) -> None:
         ) from error
     with atomic_path(path) as temporary:
         stream = rr.RecordingStream("radejax")
-        stream.save(temporary, default_blueprint=_blueprint())
+        stream.save(temporary)
         stream.log("world", rr.ViewCoordinates.FLU, static=True)
         count = 0
         for count, scene in enumerate(scenes, 1):
@@ -130,23 +130,6 @@ def yaw_quaternions(yaw_rad: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 4"
     """Return the quaternions x, y, z, w of rotations about z."""
     zero = np.zeros_like(yaw_rad)
     return np.stack([zero, zero, np.sin(yaw_rad / 2), np.cos(yaw_rad / 2)], -1)
-
-
-def _blueprint() -> Any:
-    """Return the layout of the viewer, with the 3D view next to the camera image."""
-    import rerun.blueprint as rrb
-
-    return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Spatial3DView(origin="world", name="Radar"),
-            rrb.Vertical(
-                rrb.Spatial2DView(origin="camera", name="Camera"),
-                rrb.TextDocumentView(origin="frame", name="Frame"),
-                row_shares=[4, 1],
-            ),
-            column_shares=[3, 2],
-        )
-    )
 
 
 def _log_scene(stream: Any, scene: Scene, index: int) -> None:

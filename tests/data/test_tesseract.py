@@ -12,14 +12,15 @@ from radejax.data.projection import project_tensor
 from radejax.data.tesseract import (
     Layout,
     _read_columns,
-    check_projection_npy,
-    check_tesseract,
+    check_frame,
     project_file,
     read_projection_npy,
     read_tesseract,
 )
+from radejax.geometry.radar_grid import RadarGrid
 
 SHAPE = (4, 6, 3, 5)
+GRID = RadarGrid.reduced(num_doppler=4, num_range=6, num_elevation=3, num_azimuth=5)
 
 
 @pytest.fixture
@@ -48,8 +49,8 @@ def test_every_kind_of_file(tmp_path, tesseract, kind, dtype):
     np.testing.assert_array_equal(found, tesseract)
     projection = project_file(path, shape_drea=SHAPE)
     np.testing.assert_array_equal(projection, project_tensor(tesseract.astype(dtype)))
-    check_tesseract(path, shape_drea=SHAPE)
-    check_tesseract(path, shape_drea=SHAPE, deep=True)
+    check_frame(path, GRID)
+    check_frame(path, GRID, deep=True)
 
 
 def test_integers_are_read(tmp_path):
@@ -163,11 +164,11 @@ def test_values_that_are_no_power_are_named(tmp_path, tesseract, layout):
     with pytest.raises(
         DataError, match=r"t\.mat: .* between 1 and 300, as in decibels"
     ):
-        check_tesseract(path, deep=True)
+        check_frame(path, GRID, deep=True)
     tesseract[..., tesseract.shape[3] // 3 :] = 0  # as in a file that is copied in part
     write(path, tesseract, layout)
     with pytest.raises(DataError, match=r"80% of the beams have a power of exactly 0"):
-        check_tesseract(path, deep=True)
+        check_frame(path, GRID, deep=True)
 
 
 def test_a_shape_of_unsigned_integers(tmp_path, tesseract):
@@ -194,7 +195,13 @@ def test_wrong_content_is_named(tmp_path, tesseract):
     with pytest.raises(DataError, match="flags 0x807, expected real"):
         read_tesseract(path)
     write(path, tesseract, "plain")
-    for read in (read_tesseract, project_file, check_tesseract):
+    other = RadarGrid.reduced(
+        num_doppler=4, num_range=6, num_elevation=3, num_azimuth=6
+    )
+    for deep in (False, True):
+        with pytest.raises(DataError, match=r"expected \(4, 6, 3, 6\)"):
+            check_frame(path, other, deep=deep)
+    for read in (read_tesseract, project_file):
         with pytest.raises(DataError, match=r"expected \(1, 2, 3, 4\)"):
             read(path, shape_drea=(1, 2, 3, 4))
         with pytest.raises(FileNotFoundError, match=r"none\.mat"):
@@ -217,11 +224,11 @@ def test_released_projections(tmp_path, tesseract, dtype):
     np.save(path, wanted)  # channels last
     found = read_projection_npy(path, projection_shape=(6, 5, 7))
     np.testing.assert_array_equal(found, wanted)
-    check_projection_npy(path, (6, 5, 7))
+    check_frame(path, GRID)
     np.save(path, tesseract)
-    for read in (check_projection_npy, lambda *x: read_projection_npy(x[0])):
+    for deep in (False, True):
         with pytest.raises(DataError, match="it seems to be a radar tensor"):
-            read(path, (6, 5, 7))
+            check_frame(path, GRID, deep=deep)
 
 
 def test_bad_released_projections(tmp_path):

@@ -19,13 +19,7 @@ from radejax.core.structures import CLASSES, RARE_SHARE
 from radejax.data.dataset import Summary
 from radejax.data.kradar.conditions import KRADAR_CONDITIONS, UNKNOWN_CONDITIONS
 from radejax.data.kradar.dataset import Frame, KRadar, SequenceFolder, read_calibration
-from radejax.data.reduced import check_reduced, is_reduced_file
-from radejax.data.tesseract import (
-    check_projection_npy,
-    check_tesseract,
-    read_frame,
-    read_projection_npy,
-)
+from radejax.data.tesseract import check_frame
 from radejax.geometry.radar_grid import RadarGrid
 
 Rows = list[dict[str, Any]]
@@ -145,17 +139,9 @@ def check_dataset(
         for path in [*_tensors(folder), *_projections(folder)]
     ]
     corrupted: collections.Counter[int] = collections.Counter()
-    grid = data.grid
     for number, path in tqdm(tensors, "check", unit="file", disable=not progress):
         try:
-            if path.suffix == ".mat":
-                check_tesseract(path, shape_drea=grid.shape_drea, deep=deep)
-            elif is_reduced_file(path):
-                (read_frame if deep else check_reduced)(path, grid)
-            elif deep:
-                read_projection_npy(path, projection_shape=grid.projection_shape)
-            else:
-                check_projection_npy(path, grid.projection_shape)
+            check_frame(path, data.grid, deep=deep)
         except DataError as error:
             kind = "tesseract" if path.suffix == ".mat" else "projection"
             summary.problems.append((f"{kind} corrupted", str(error)))

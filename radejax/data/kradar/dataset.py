@@ -575,14 +575,14 @@ def find_release(folders: Mapping[int, SequenceFolder]) -> str | None:
     for folder in folders.values():
         for name in ("radar_tesseract", "DERA_tesseract", "."):
             for path in folder.listing(name).values():
+                form = path.name.partition("_")[0] if name == "." else "tesseract"
                 if path.suffix in (".mat", ".npy"):
-                    form = path.name.partition("_")[0] if name == "." else "tesseract"
                     found.setdefault(form, path)
-    forms = [form for form in ("tesseract", *RELEASES) if form in found]
+    forms = [found[form] for form in ("tesseract", *RELEASES) if form in found]
     if len(forms) > 1:
         raise UserError(
-            f"{found[forms[0]]} and {found[forms[1]]} are different forms of radar data, "
-            "which cannot be mixed in one dataset: name only roots of one form"
+            f"{forms[0]} and {forms[1]} are different forms of radar data, which cannot "
+            "be mixed in one dataset: name only roots of one form"
         )
     if not forms and "sprdr" in found:
         raise UserError(f"{found['sprdr']}: {UNUSABLE_POINTS}")

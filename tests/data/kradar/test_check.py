@@ -94,10 +94,10 @@ def test_projections_are_checked_too(root):
 
 
 def test_a_file_that_cannot_be_read_is_not_corrupted(root, monkeypatch):
-    def fail(path, **_):
+    def fail(path, *_, **__):
         raise OSError(errno.EIO, "Input/output error", str(path))
 
-    monkeypatch.setattr(check, "check_tesseract", fail)
+    monkeypatch.setattr(check, "check_frame", fail)
     report = check_dataset(root)
     assert report.summary.problem_counts() == {"tesseract not readable": 12}
     assert report.sequences[0]["tesseracts_corrupted"] == 0
