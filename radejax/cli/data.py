@@ -1,4 +1,4 @@
-"""Commands that prepare datasets: `simulate`, `data check`, `preprocess` and `embed`."""
+"""Commands that prepare datasets: from `simulate` and `data check` to `embed`."""
 
 from __future__ import annotations
 
@@ -142,6 +142,42 @@ def preprocess(
     report = records.preprocess(
         frames, out, dtype=dtype, shard=shard, num_workers=num_workers
     )
+    click.echo(report.to_text())
+    if report.skipped:
+        raise SystemExit(entry.FAILED)
+
+
+@click.command(cls=entry.Command)
+@entry.roots
+@click.option(
+    "--out", required=True, type=entry.FOLDER, help="Root of the new dataset."
+)
+@click.option(
+    "--to",
+    "release",
+    required=True,
+    type=click.Choice(["polar3d", "rpc"]),
+    help="polar3d: mean power and Doppler of every cell. rpc: the strongest cells.",
+)
+@click.option(
+    "--rate",
+    type=entry.FRACTION,
+    default=0.01,
+    help="Fraction of the cells (rpc only).",
+)
+def reduce(
+    roots: tuple[str, ...], out: pathlib.Path, release: str, rate: float
+) -> None:
+    """Write the files of K-Radar's reduced releases from radar tensors.
+
+    The other files of ROOTS become symbolic links. Run again, it writes only missing files.
+    Tensors that are corrupted are skipped and listed, with exit code 1.
+
+    Example: radejax reduce /disk1/kradar --to rpc --rate 0.01 --out /fast/points
+    """
+    from radejax.data.kradar.reduce import reduce_dataset
+
+    report = reduce_dataset(roots, out, release, rate)
     click.echo(report.to_text())
     if report.skipped:
         raise SystemExit(entry.FAILED)

@@ -28,8 +28,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, Real
 
-from radejax.core.archives import read_npy
-from radejax.core.errors import DataError, require
+from radejax.core.errors import DataError
 from radejax.core.files import PathLike, as_path
 from radejax.data.projection import MAX_ZERO_SHARE, to_log_scale
 from radejax.geometry.radar_grid import RadarGrid
@@ -45,14 +44,14 @@ UNUSABLE_POINTS = (
 POWER_UNIT = 1e13
 """Released powers are linear power divided by this."""
 
+Polar = Float[np.ndarray, "2 R A E"]
+"""Mean power in `POWER_UNIT` and mean Doppler in m/s."""
+
 _MAX_POWER = 1e6  # far above any echo divided by POWER_UNIT, far below undivided noise
 _DECIBELS = (20.0, 300.0)  # range of undivided noise and echoes in decibels
 
 _KRADAR_DOPPLER_MPS = np.linspace(-1.932591218305504, 1.872197742733457, 64)
 """K-Radar's Doppler axis, of which `RadarGrid.kradar` has six decimals."""
-
-_ROWS = 16
-"""Ranges that are projected at a time, so that they stay in the cache."""
 
 
 def is_reduced_file(path: PathLike) -> bool:
@@ -78,21 +77,6 @@ def polar_shape(grid: RadarGrid) -> tuple[int, int, int, int]:
     return 2, grid.num_range, grid.num_azimuth, grid.num_elevation
 
 
-def read_reduced(path: PathLike, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
-    """Computes `project_reduced` of a file.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        DataError: The file is corrupted, or see `project_reduced`.
-    """
-    return project_reduced(read_npy(path, mapped=True), grid, str(path))
-
-
-def check_reduced(path: PathLike, grid: RadarGrid) -> None:
-    """Raises the errors of `read_reduced` that header and size of a file show."""
-    _check_layout(read_npy(path, mapped=True), grid, str(path))
-
-
 def project_reduced(
     frame: Real[np.ndarray, "..."], grid: RadarGrid, name: str = "frame"
 ) -> Float[np.ndarray, "R A DE"]:
@@ -109,61 +93,39 @@ def project_reduced(
         DataError: Shape, type or scale differ from those of the release, or a point does
             not lie at a bin of the grid.
     """
-    _check_layout(frame, grid, name)
+    if frame.ndim == 2 and frame.shape[1] == 5:
+        frame = frame[frame[:, :3].any(axis=1)]
+    check_layout(frame, grid, name)
     projection = np.empty(grid.projection_shape, np.float32)
     if frame.ndim == 2:
-        if frame.shape[1] == 5:
-            frame = frame[frame[:, :3].any(axis=1)]
-        _check_values(*frame.T[3:5], grid, name)
-        bins = _bins_of_points(frame, grid, name)
-        beams = bins[0] * grid.num_azimuth + bins[1]
-        _fill(projection, bins, beams, *frame.T[3:5], grid)
-        return projection
-    _check_values(*frame, grid, name)
-    beams = np.arange(_ROWS * grid.num_azimuth).reshape(_ROWS, -1, 1)
-    for start in range(0, grid.num_range, _ROWS):
-        power, doppler = frame[:, start : start + _ROWS]
-        part = projection[start : start + _ROWS]
-        _fill(part, ..., beams[: len(part)], power, doppler, grid)
+        bins: Any = _bins_of_points(frame, grid, name)
+        beams = bins[0][None] * grid.num_azimuth + bins[1]
+        cells, rows = frame.T[3:5, None], grid.num_range
+    else:
+        # So few rows at a time stay in the cache.
+        bins, cells, rows = ..., frame, 16
+        beams = np.arange(rows * grid.num_azimuth).reshape(rows, -1, 1)
+    _check_values(cells, grid, name)
+    if grid.num_doppler:
+        first_mps, last_mps = map(float, grid.doppler_mps[[0, -1]])
+        bins_per_mps = (grid.num_doppler - 1) / (last_mps - first_mps or 1.0)
+    for start in range(0, grid.num_range, rows):
+        part = projection[start : start + rows]
+        power, doppler = cells[:, start : start + rows]
+        levels = to_log_scale(power.astype(np.float32) * np.float32(POWER_UNIT))
+        # The lowest level over elevation; of points, the lowest of all.
+        part[...] = levels.min(axis=-1, keepdims=True)
+        part[..., grid.num_doppler :][bins] = levels
+        if grid.num_doppler:
+            channels = np.rint((doppler.astype(np.float32) - first_mps) * bins_per_mps)
+            # fmin and fmax also replace NaN, which cells without power have.
+            channels = np.fmax(np.fmin(channels, grid.num_doppler - 1), 0)
+            index = beams[: len(part)] * part.shape[-1] + channels.astype(np.intp)
+            np.maximum.at(part.reshape(-1), index.ravel(), levels.ravel())
     return projection
 
 
-def _fill(
-    projection: Float[np.ndarray, "r A DE"],
-    bins: Any,
-    beams: Int[np.ndarray, "..."],
-    power: Float[np.ndarray, "*cells"],
-    doppler: Float[np.ndarray, "*cells"],
-    grid: RadarGrid,
-) -> None:
-    """Computes rows of a projection from cells.
-
-    Args:
-        projection: C-contiguous rows to write.
-        bins: Index of the cells in the elevation half of the rows.
-        beams: Positions of the cells among the range-azimuth bins of the rows.
-        power: Power of the cells in `POWER_UNIT`.
-        doppler: Mean Doppler of the cells.
-        grid: Axes of the radar.
-    """
-    levels = to_log_scale(power.astype(np.float32) * np.float32(POWER_UNIT))
-    # The lowest level over elevation; for points, that of the weakest.
-    projection[...] = levels.min(axis=-1, keepdims=True)
-    projection[..., grid.num_doppler :][bins] = levels
-    if not grid.num_doppler:
-        return
-    first_mps, last = float(grid.doppler_mps[0]), grid.num_doppler - 1
-    scale = last / (float(np.ptp(grid.doppler_mps)) or 1.0)
-    channels = np.rint((doppler.astype(np.float32) - first_mps) * scale)
-    # fmin and fmax also replace NaN, which the release has where the power is 0.
-    channels = np.fmax(np.fmin(channels, last), 0).astype(np.intp)
-    cells = (beams * projection.shape[-1] + channels).ravel()
-    np.maximum.at(projection.reshape(-1), cells, levels.ravel())
-
-
-def reduce_tensor(
-    tesseract: Real[np.ndarray, "D R E A"], grid: RadarGrid
-) -> Float[np.ndarray, "2 R A E"]:
+def reduce_tensor(tesseract: Real[np.ndarray, "D R E A"], grid: RadarGrid) -> Polar:
     """Computes a `polar3d` array in float64 from a 4D radar tensor of linear power.
 
     The steps have the precision of K-Radar's: that of the tensor, and float64 from the
@@ -184,11 +146,7 @@ def reduce_tensor(
 
 
 def strongest_points(
-    polar: Float[np.ndarray, "2 R A E"],
-    grid: RadarGrid,
-    rate: float,
-    *,
-    range_wise: bool = False,
+    polar: Polar, grid: RadarGrid, rate: float, range_wise: bool = False
 ) -> Float[np.ndarray, "N 11"]:
     """Returns the points of an `rpc` file from a `polar3d` array.
 
@@ -198,11 +156,7 @@ def strongest_points(
         rate: Fraction of the cells that become points, above 0 and below 1.
         range_wise: Whether to take this fraction of the cells at every range, instead of
             all cells.
-
-    Raises:
-        UserError: The rate is out of its range.
     """
-    require(0 < rate < 1, "rate", rate, "a number above 0 and below 1")
     power, doppler = polar
     axes = (1, 2) if range_wise else None
     bins = np.nonzero(power > np.quantile(power, 1 - rate, axis=axes, keepdims=True))
@@ -212,11 +166,8 @@ def strongest_points(
 
 def _points_at(bins: Any, grid: RadarGrid) -> Float[np.ndarray, "6 N"]:
     """Returns x, y, z, range, azimuth and elevation of bins, in the signs of points."""
-    r, azimuth, elevation = (
-        grid.range_m[bins[0]],
-        -grid.azimuth_rad[bins[1]],
-        -grid.elevation_rad[bins[2]],
-    )
+    r = grid.range_m[bins[0]]
+    azimuth, elevation = -grid.azimuth_rad[bins[1]], -grid.elevation_rad[bins[2]]
     ground = r * np.cos(elevation)
     xyz = ground * np.cos(azimuth), ground * np.sin(azimuth), r * np.sin(elevation)
     return np.stack([*xyz, r, azimuth, elevation])
@@ -234,10 +185,10 @@ def _bins_of_points(
     else:
         ground = np.hypot(x, y)
         polar = np.hypot(ground, z), -np.arctan2(y, x), -np.arctan2(z, ground)
-        stored = [
-            np.searchsorted((axis[1:] + axis[:-1]) / 2, values)
-            for axis, values in zip(axes, polar, strict=True)
-        ]
+        pairs = zip(polar, axes, strict=True)
+        stored = np.rint(
+            [np.interp(v, axis, np.arange(axis.size)) for v, axis in pairs]
+        )
     # NaN becomes bin 0. Then, as for bins outside the grid, the position is another one.
     bins = np.nan_to_num(np.clip(stored, 0, sizes - 1)).astype(np.intp)
     is_far = ~(np.abs(_points_at(bins, grid)[:3] - xyz) <= np.diff(axes[0]).min() / 2)
@@ -245,13 +196,13 @@ def _bins_of_points(
         row = int(is_wrong.argmax())
         raise DataError(
             f"{name}: point {row} has x, y, z = {xyz[:, row].round(2).tolist()} m and bins "
-            f"{np.asarray(stored)[:, row].tolist()}, which is not a point on the radar's "
+            f"{stored[:, row].tolist()}, which is not a point on the radar's "
             f"grid of {' x '.join(map(str, sizes.ravel()))} bins (range, azimuth, elevation)"
         )
     return tuple(bins)
 
 
-def _check_layout(frame: Real[np.ndarray, "..."], grid: RadarGrid, name: str) -> None:
+def check_layout(frame: Real[np.ndarray, "..."], grid: RadarGrid, name: str) -> None:
     """Raises a `DataError` unless shape and type are those of a reduced release."""
     columns = frame.shape[1] if frame.ndim == 2 and len(frame) else None
     if columns == 4:
@@ -266,26 +217,22 @@ def _check_layout(frame: Real[np.ndarray, "..."], grid: RadarGrid, name: str) ->
 
 
 def _check_values(
-    power: Float[np.ndarray, "..."],
-    doppler: Float[np.ndarray, "..."],
-    grid: RadarGrid,
-    name: str,
+    cells: Float[np.ndarray, "2 ..."], grid: RadarGrid, name: str
 ) -> None:
     """Raises a `DataError` if power or Doppler are not on the scale of the releases."""
-    low, high, problem = float(power.min()), float(power.max()), None
+    power, doppler = cells
+    low, high, is_empty = float(power.min()), float(power.max()), power == 0
     first, last = grid.doppler_mps[[0, -1]] if grid.num_doppler else (-np.inf, np.inf)
-    if not 0 <= low <= high < np.inf:
-        problem = "some powers are negative (as decibels are), infinite or NaN"
-    elif _DECIBELS[0] < low and high <= _DECIBELS[1]:
-        problem = "the powers seem to be decibels"
-    elif high > _MAX_POWER:
-        problem = f"the powers seem not to be divided by {POWER_UNIT:g}"
-    elif low == 0 and (share := np.mean(power == 0)) > MAX_ZERO_SHARE:
-        problem = f"{share:.0%} of the powers are exactly 0"
-    elif not (((doppler >= first) & (doppler <= last)) | (power == 0)).all():
-        problem = f"Doppler outside the radar's axis of {first:.3g} to {last:.3g} m/s"
-    if problem:
+    is_fine = ((doppler >= first) & (doppler <= last)) | is_empty
+    is_decibels = low > _DECIBELS[0] and high <= _DECIBELS[1]
+    share = np.mean(is_empty)
+    if not 0 <= low <= high <= _MAX_POWER or is_decibels or share > MAX_ZERO_SHARE:
         raise DataError(
-            f"{name}: powers from {low:.3g} to {high:.3g}, expected linear power divided "
-            f"by {POWER_UNIT:g}, and mean Doppler in m/s: {problem}"
+            f"{name}: powers from {low:.3g} to {high:.3g}, {share:.0%} of them 0; expected "
+            f"linear power (not decibels) divided by {POWER_UNIT:g}, at most 5 % of them 0"
+        )
+    if not is_fine.all():
+        raise DataError(
+            f"{name}: mean Doppler of {doppler[~is_fine].flat[0]:.3g} m/s, expected "
+            f"{first:.3g} to {last:.3g}"
         )

@@ -38,7 +38,7 @@ from radejax.data.projection import (
     project_columns,
     project_tensor,
 )
-from radejax.data.reduced import check_reduced, is_reduced_file, read_reduced
+from radejax.data.reduced import check_layout, is_reduced_file, project_reduced
 from radejax.geometry.radar_grid import RadarGrid
 
 VARIABLE = "arrDREA"
@@ -150,7 +150,7 @@ def read_frame(path: PathLike, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
     if pathlib.Path(path).suffix != ".npy":
         return project_file(path, shape_drea=grid.shape_drea)
     if is_reduced_file(path):
-        return read_reduced(path, grid)
+        return project_reduced(read_npy(path, mapped=True), grid, str(path))
     projection = read_projection_npy(path, projection_shape=grid.projection_shape)
     return projection.astype(np.float32)
 
@@ -163,7 +163,7 @@ def check_frame(path: PathLike, grid: RadarGrid, *, deep: bool = False) -> None:
     if deep:
         read_frame(path, grid)
     elif is_reduced_file(path):
-        check_reduced(path, grid)
+        check_layout(read_npy(path, mapped=True), grid, str(path))
     elif pathlib.Path(path).suffix == ".npy":
         _projection_axes(path, read_npy(path, mapped=True), grid.projection_shape)
     else:

@@ -95,6 +95,9 @@ class Data:
             sequence_numbers=options.sequences or None,
             weather=options.weather or None,
         )
+        if self.frames.release is not None and not config.model.doppler_bins:
+            grid = dataclasses.replace(self.frames.grid, doppler_mps=np.array([]))
+            self.frames.grid = grid
         if options.format != "kradar":  # the reader of K-Radar checks its labels itself
             self.frames = self.frames.with_valid_boxes()
 

@@ -194,7 +194,6 @@ class KRadar(LabelledFrames[Frame]):
             self._label_source = str(labels)
             self._label_paths = find_labels(as_path(labels))
             self._split_folders += [as_path(labels), as_path(labels).parent]
-        grid = _read_common(roots, "radar_grid.json", RadarGrid.from_dict)
         z_m = _read_common(
             self._split_folders,
             SIMULATION_MARKER,
@@ -202,7 +201,7 @@ class KRadar(LabelledFrames[Frame]):
         )
         # K-Radar's own files do not contain the height offset between radar and LiDAR.
         self._radar_from_lidar_z_m = KRADAR_RADAR_FROM_LIDAR_Z_M if z_m is None else z_m
-        super().__init__([], grid or RadarGrid.kradar(), is_simulated=z_m is not None)
+        super().__init__([], read_grid(roots), is_simulated=z_m is not None)
         self._camera_folders = _as_paths(camera_calibration)
         self._camera_folders += [r / name for r in roots for name in _CAMERA_FOLDERS]
         self._common_camera = common_camera
@@ -638,6 +637,16 @@ def _read_common(
             "cannot be read as one"
         )
     return next(iter(found.values()), None)
+
+
+def read_grid(roots: Sequence[pathlib.Path]) -> RadarGrid:
+    """Returns the sensor axes of the `radar_grid.json` in a root, or those of K-Radar.
+
+    Raises:
+        DataError: The file is malformed, or the roots have different ones.
+    """
+    grid = _read_common(roots, "radar_grid.json", RadarGrid.from_dict)
+    return grid or RadarGrid.kradar()
 
 
 # Label files -------------------------------------------------------------------------
