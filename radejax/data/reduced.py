@@ -13,8 +13,8 @@ m (in the unit of the tensor) has the level (10 log10(m + 1e-10) + 1.2) / 184.3,
 distributed power, the maximum of 64 bins is 6.8 dB above the mean on average (0.037 levels);
 for an echo in a single bin, at most 18 dB (0.098 levels). The Doppler half is reconstructed:
 each cell contributes its level at the bin of its mean Doppler, and the maximum over elevation
-is taken. Other Doppler bins have the lowest level over elevation. Cells without a point have
-the level of the weakest point, which is an upper bound.
+is taken. Other Doppler bins have the lowest level over elevation. Bins without a point have
+`EMPTY_LEVEL`, or the level of the weakest point if that is lower.
 
 References:
     K-Radar, `datasets/kradar_detection_v2_1.py` (commit 97fe0a6): `get_cube_polar` and
@@ -47,8 +47,11 @@ POWER_UNIT = 1e13
 Polar = Float[np.ndarray, "2 R A E"]
 """Mean power in `POWER_UNIT` and mean Doppler in m/s."""
 
+EMPTY_LEVEL = 0.5
+"""Level of bins without a point, a little below K-Radar's noise."""
+
 _MAX_POWER = 1e6  # far above any echo divided by POWER_UNIT, far below undivided noise
-_DECIBELS = (20.0, 300.0)  # range of undivided noise and echoes in decibels
+_MIN_DECIBELS = 60.0  # undivided noise is above
 
 _KRADAR_DOPPLER_MPS = np.linspace(-1.932591218305504, 1.872197742733457, 64)
 """K-Radar's Doppler axis, of which `RadarGrid.kradar` has six decimals."""
@@ -113,8 +116,8 @@ def project_reduced(
         part = projection[start : start + rows]
         power, doppler = cells[:, start : start + rows]
         levels = to_log_scale(power.astype(np.float32) * np.float32(POWER_UNIT))
-        # The lowest level over elevation; of points, the lowest of all.
-        part[...] = levels.min(axis=-1, keepdims=True)
+        lowest = levels.min(axis=-1, keepdims=True)  # over elevation, or of all points
+        part[...] = lowest if frame.ndim > 2 else np.minimum(lowest, EMPTY_LEVEL)
         part[..., grid.num_doppler :][bins] = levels
         if grid.num_doppler:
             channels = np.rint((doppler.astype(np.float32) - first_mps) * bins_per_mps)
@@ -224,7 +227,7 @@ def _check_values(
     low, high, is_empty = float(power.min()), float(power.max()), power == 0
     first, last = grid.doppler_mps[[0, -1]] if grid.num_doppler else (-np.inf, np.inf)
     is_fine = ((doppler >= first) & (doppler <= last)) | is_empty
-    is_decibels = low > _DECIBELS[0] and high <= _DECIBELS[1]
+    is_decibels = _MIN_DECIBELS < low <= high < 2 * low
     share = np.mean(is_empty)
     if not 0 <= low <= high <= _MAX_POWER or is_decibels or share > MAX_ZERO_SHARE:
         raise DataError(

@@ -43,7 +43,7 @@ def reduce_dataset(
     began, out, paths = time.perf_counter(), as_path(out), list(map(as_path, roots))
     grid, targets = read_grid(paths), {}
     for root in paths:
-        shutil.copytree(root, out, True, _LEFT_OUT, _link, dirs_exist_ok=True)
+        shutil.copytree(root, out, False, _LEFT_OUT, _link, dirs_exist_ok=True)
     for folder in find_sequences(paths).values():
         for path in folder.listing("radar_tesseract").values():
             name = f"{release}_{path.stem.rpartition('_')[2]}.npy"
