@@ -224,18 +224,25 @@ def _check_values(
 ) -> None:
     """Raises a `DataError` if power or Doppler are not on the scale of the releases."""
     power, doppler = cells
-    low, high, is_empty = float(power.min()), float(power.max()), power == 0
-    first, last = grid.doppler_mps[[0, -1]] if grid.num_doppler else (-np.inf, np.inf)
-    is_fine = ((doppler >= first) & (doppler <= last)) | is_empty
+    low, high = float(power.min()), float(power.max())
+    share = 0.0 if low else np.mean(power == 0)
     is_decibels = _MIN_DECIBELS < low <= high < 2 * low
-    share = np.mean(is_empty)
     if not 0 <= low <= high <= _MAX_POWER or is_decibels or share > MAX_ZERO_SHARE:
         raise DataError(
             f"{name}: powers from {low:.3g} to {high:.3g}, {share:.0%} of them 0; expected "
             f"linear power (not decibels) divided by {POWER_UNIT:g}, at most 5 % of them 0"
         )
-    if not is_fine.all():
+    limit_mps = 1.01 * np.abs(grid.doppler_mps).max(
+        initial=0.0
+    )  # a mean may be rounded
+    if (
+        not grid.num_doppler
+        or -limit_mps <= doppler.min() <= doppler.max() <= limit_mps
+    ):
+        return
+    is_far = ~(np.abs(doppler) <= limit_mps) & (power > 0)
+    if is_far.any():
         raise DataError(
-            f"{name}: mean Doppler of {doppler[~is_fine].flat[0]:.3g} m/s, expected "
-            f"{first:.3g} to {last:.3g}"
+            f"{name}: mean Doppler of {doppler[is_far][0]:.3g} m/s, expected from "
+            f"{-limit_mps:.3g} to {limit_mps:.3g}"
         )

@@ -223,7 +223,7 @@ BAD = {
     "infinity": (lambda: _with(_polar(), np.s_[0, 3, 2, 1], np.inf), "to inf"),
     "Doppler": (
         lambda: _with(_polar(), np.s_[1, 3, 2, 1], 2.5),
-        "mean Doppler of 2.5 m/s, expected -1.93 to 1.45",
+        "mean Doppler of 2.5 m/s, expected from -1.95 to 1.95",
     ),
     "bin outside": (
         lambda: _with(_points(), np.s_[3, 8], 20),
