@@ -148,7 +148,8 @@ def read_frame(path: PathLike, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
         DataError: The file is corrupted or has another shape than the grid.
     """
     if pathlib.Path(path).suffix != ".npy":
-        return project_file(path, shape_drea=grid.shape_drea)
+        projection = project_file(path, shape_drea=grid.shape_drea)
+        return grid.measured_channels(projection)
     if is_reduced_file(path):
         return project_reduced(read_npy(path, mapped=True), grid, str(path))
     projection = read_projection_npy(path, projection_shape=grid.projection_shape)

@@ -87,7 +87,7 @@ def detect(
             may be traced.
     """
     if frames.ndim == 5:
-        frames = project_jax(frames)
+        frames = grid.measured_channels(project_jax(frames))
     inputs = (to_float(frames),) if image is None else (to_float(frames), image, camera)
     maps: Any = model.apply(variables, *inputs, train=False)
     return decode(maps, grid, **{**options, **(settings or {})})

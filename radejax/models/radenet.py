@@ -19,6 +19,7 @@ from radejax.core.errors import (
     SIZE,
     UserError,
     check_options,
+    integer,
     one_of,
     require,
 )
@@ -45,8 +46,8 @@ class RadeNet(nn.Module):
 
     Attributes:
         num_classes: Channels of the heatmap.
-        doppler_bins: Number of Doppler channels, the first of the projection.
-        elevation_bins: Number of elevation channels, which follow the Doppler channels.
+        doppler_bins: Number of Doppler channels, the first of the projection; 0 for none.
+        elevation_bins: Number of elevation channels, which follow them; 0 for none.
         widths: Channels of the encoder levels, finest first.
         decoder_width: Channels of the last decoder stage and of the neck.
         num_groups: Groups of every normalization; must divide every width.
@@ -87,10 +88,11 @@ class RadeNet(nn.Module):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        sizes = ["num_classes", "doppler_bins", "elevation_bins", "decoder_width"]
-        sizes += ["num_groups", "pad_multiple"]
+        sizes = ["num_classes", "decoder_width", "num_groups", "pad_multiple"]
+        channels = ["doppler_bins", "elevation_bins"]
         ranges = {
             **dict.fromkeys(sizes, SIZE),
+            **dict.fromkeys(channels, integer(0, 1 << 16)),
             "widths": (
                 lambda widths: len(widths) > 0 and all(map(SIZE[0], widths)),
                 "one or several integers of at least 1",
@@ -106,6 +108,9 @@ class RadeNet(nn.Module):
             "input_scale": POSITIVE,
         }
         check_options(vars(self), "config.model", ranges)
+        least = "above 0 if config.model.doppler_bins is 0"
+        is_some = self.doppler_bins + self.elevation_bins > 0
+        require(is_some, "config.model.elevation_bins", self.elevation_bins, least)
         stride = 2 ** len(self.widths)
         require(
             self.pad_multiple % stride == 0,

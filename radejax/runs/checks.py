@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+from collections.abc import Sequence
 from typing import Any
 
 from ml_collections import ConfigDict
@@ -86,8 +87,8 @@ _LOGGING = {
     ),
 }
 _SIZE = integer(1)
-_GRID = dict.fromkeys(("num_doppler", "num_range", "num_elevation"), _SIZE)
-_GRID |= {"num_azimuth": _SIZE, "max_range_m": POSITIVE}
+_GRID = dict.fromkeys(("num_doppler", "num_elevation"), integer(0))
+_GRID |= {"num_range": integer(2), "num_azimuth": integer(2), "max_range_m": POSITIVE}
 _KINDS: dict[type, Any] = {float: int | float, tuple: tuple | list}
 _OPTIONAL = ("data.visibility", "evaluation.roi", "train.checkpoints_to_keep")
 # Sections that not every config has. Their constructors check the names of the fields.
@@ -146,15 +147,21 @@ def _check_pairs(config: ConfigDict) -> None:
         require(best in known, "config.train.best_metric", best, f"one of {known}")
 
 
-def check_bins(model: ConfigDict, grid: RadarGrid, source: str) -> None:
+def check_bins(
+    model: ConfigDict,
+    grid: RadarGrid,
+    source: str,
+    axes: Sequence[str] = ("doppler", "elevation"),
+) -> None:
     """Raises `UserError` if the Doppler or elevation bins of a model and a grid differ.
 
     Args:
         model: The section `config.model`.
         grid: Grid of the radar.
         source: Description of the radar for the error message.
+        axes: Axes to check.
     """
-    for name in ("doppler", "elevation"):
+    for name in axes:
         bins, expected = model[f"{name}_bins"], getattr(grid, f"num_{name}")
         text = f"{expected}, as {source} has"
         require(bins == expected, f"config.model.{name}_bins", bins, text)
@@ -163,10 +170,14 @@ def check_bins(model: ConfigDict, grid: RadarGrid, source: str) -> None:
 def _check_simulation(config: ConfigDict) -> None:
     if "simulation" not in config:
         return
-    if isinstance(config.simulation.grid, ConfigDict):
+    if (
+        "num_range" in config.simulation.grid
+    ):  # not "kradar" and no fields of a RadarGrid
         check_options(config.simulation.grid, "config.simulation.grid", _GRID)
     grid = SimulationConfig.from_mapping(config.simulation).make_grid()
-    check_bins(config.model, grid, "config.simulation.grid")
+    # Frames of a reduced release can be read without their Doppler.
+    axes = ("doppler", "elevation") if config.model.doppler_bins else ("elevation",)
+    check_bins(config.model, grid, "config.simulation.grid", axes)
 
 
 def _check_fields(config: ConfigDict) -> None:

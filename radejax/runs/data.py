@@ -96,8 +96,7 @@ class Data:
             weather=options.weather or None,
         )
         if self.frames.release is not None and not config.model.doppler_bins:
-            grid = dataclasses.replace(self.frames.grid, doppler_mps=np.array([]))
-            self.frames.grid = grid
+            self.frames.grid = self.frames.grid.without_doppler()
         if options.format != "kradar":  # the reader of K-Radar checks its labels itself
             self.frames = self.frames.with_valid_boxes()
 

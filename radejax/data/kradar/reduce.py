@@ -42,6 +42,9 @@ def reduce_dataset(
     require(0 < rate < 1, "rate", rate, "a number above 0 and below 1")
     began, out, paths = time.perf_counter(), as_path(out), list(map(as_path, roots))
     grid, targets = read_grid(paths), {}
+    sizes = f"{grid.num_doppler} Doppler and {grid.num_elevation} elevation bins"
+    is_4d = grid.num_doppler > 1 and grid.num_elevation > 0
+    require(is_4d, "the radar", sizes, "Doppler and elevation")
     for root in paths:
         shutil.copytree(root, out, False, _LEFT_OUT, _link, dirs_exist_ok=True)
     for folder in find_sequences(paths).values():
