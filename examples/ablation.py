@@ -11,6 +11,7 @@
 | sigma | widths of the Gaussians in the heatmap targets |
 | quickstart | the quickstart's input scaling and longer training |
 | camera | the quickstart with and without a camera |
+| releases | radar tensors and K-Radar's reduced releases, made from the same scenes |
 
 A variant is an ordinary run of a config, or the run of another variant evaluated with shuffled
 images. Runs are trained on the scenes of their seed and evaluated on held-out scenes, which are
@@ -51,6 +52,7 @@ from radejax.core import files
 from radejax.core.config import load_config
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
+from radejax.data.kradar.reduce import reduce_dataset
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files import Source, load
 from radejax.evaluation.report import rendered
@@ -118,7 +120,8 @@ class Work:
         kind, name = cell.config.partition(":")[0], "held"
         if seed is not None:
             name = f"{self.config(cell, seed).simulation.train_sequences}-seed{seed}"
-        return self.out / "data" / f"{kind}-{name}"
+        end = f"-{cell.release.replace(' ', '')}" if cell.release else ""
+        return self.out / "data" / f"{kind}-{name}{end}"
 
     def data(self, cell: Cell, seed: int | None) -> str:
         """Simulates the data of `root` if they are missing and returns their folder."""
@@ -127,7 +130,17 @@ class Work:
             simulation |= {"seed": HELD_OUT_SEED, "frames_per_sequence": 1}
             simulation |= {"train_sequences": 0, "test_sequences": self.study.held_out}
             simulation["vru_density_scale"] = 1.0  # only training scenes are scaled
-        return str(simulate_dataset(simulation, self.root(cell, seed)))
+        root = self.root(cell, seed)
+        if cell.release is None:
+            return str(simulate_dataset(simulation, root))
+        # The releases share the tensors.
+        tensors = self.root(dataclasses.replace(cell, release="tensors"), seed)
+        simulate_dataset(simulation, tensors)
+        release, _, rate = cell.release.partition(" ")
+        report = reduce_dataset([tensors], root, release, float(rate or 0.01))
+        if report.skipped:
+            raise UserError(report.to_text())
+        return str(root)
 
     def alone(self) -> contextlib.AbstractContextManager[None]:
         """Returns a lock to hold while data that all seeds share are made."""
