@@ -184,12 +184,13 @@ def _add_camera_model(model: ConfigDict) -> None:
 
 
 def _axes(axes: LiftingAxes) -> ConfigDict:
-    """Centers of the radar queries: first and step; for elevation first and last."""
+    """Axes of the radar queries."""
     return ConfigDict(
         {
-            # Center of the first query in range and the step, in meters.
+            # Center of the first query in range and the step, in meters; or the centers of
+            # all bins if they are not uniform.
             "range_m": axes.range_m,
-            # Center of the first query in azimuth and the step, in degrees.
+            # The same in azimuth, in degrees.
             "azimuth_deg": axes.azimuth_deg,
             # Elevation span in degrees, which `fusion.num_elevation` segments divide.
             "elevation_deg": axes.elevation_deg,

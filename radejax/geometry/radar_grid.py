@@ -329,16 +329,13 @@ class RadarGrid(ArrayValues):
         # middle of the axis, so that a point straight ahead lies exactly in the middle
         # even in float32.
         axis, last = self.range_m, self.num_range - 1
-        if is_uniform(axis):
-            span = float(axis[-1] - axis[0])
-            range_bin = (range_m - float(axis[0])) * last / span
-        else:
+        range_bin = (range_m - float(axis[0])) * last / float(axis[-1] - axis[0])
+        if not is_uniform(axis):
             range_bin = _interpolated(range_m, axis, np.arange(axis.size))
         axis, last = self.azimuth_rad, self.num_azimuth - 1
-        if is_uniform(axis):
-            span, middle = float(axis[-1] - axis[0]), float(axis[-1] + axis[0]) / 2
-            azimuth_bin = (azimuth - middle) * last / span + last / 2
-        else:
+        span, middle = float(axis[-1] - axis[0]), float(axis[-1] + axis[0]) / 2
+        azimuth_bin = (azimuth - middle) * last / span + last / 2
+        if not is_uniform(axis):
             azimuth_bin = _interpolated(azimuth, axis, np.arange(axis.size))
         return xp.stack([range_bin, azimuth_bin], -1)
 
