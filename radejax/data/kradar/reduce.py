@@ -17,7 +17,7 @@ from radejax.data.records import PreprocessReport
 from radejax.data.reduced import reduce_tensor, strongest_points
 from radejax.data.tesseract import project_file, read_tesseract
 
-_LEFT_OUT = shutil.ignore_patterns("radar_tesseract", "DERA_tesseract", "records")
+_LEFT_OUT = shutil.ignore_patterns("radar_tesseract", "DERA_tesseract", "records*")
 
 
 def reduce_dataset(
