@@ -11,14 +11,16 @@ import radejax
 from radejax.cli import entry
 from radejax.core.errors import UserError
 
+_new_root = click.option(
+    "--out", required=True, type=entry.FOLDER, help="Root of the new dataset."
+)
+
 
 @click.command(cls=entry.Command)
 @click.option(
     "--config", help="Config with a `simulation` section. Default: a small dataset."
 )
-@click.option(
-    "--out", required=True, type=entry.FOLDER, help="Root of the new dataset."
-)
+@_new_root
 @click.option("--seed", type=click.IntRange(0), help="Replaces the config's seed.")
 @click.option("--scenes", help='"procedural", or a label folder or zip of K-Radar.')
 @entry.sequences
@@ -149,9 +151,7 @@ def preprocess(
 
 @click.command(cls=entry.Command)
 @entry.roots
-@click.option(
-    "--out", required=True, type=entry.FOLDER, help="Root of the new dataset."
-)
+@_new_root
 @click.option(
     "--to",
     "release",
@@ -165,9 +165,7 @@ def preprocess(
     default=0.01,
     help="Fraction of the cells (rpc only).",
 )
-def reduce(
-    roots: tuple[str, ...], out: pathlib.Path, release: str, rate: float
-) -> None:
+def reduce(roots: tuple[str, ...], out: pathlib.Path, **options: Any) -> None:
     """Write the files of K-Radar's reduced releases from radar tensors.
 
     The other files of ROOTS become symbolic links. Run again, it writes only missing files.
@@ -177,7 +175,7 @@ def reduce(
     """
     from radejax.data.kradar.reduce import reduce_dataset
 
-    report = reduce_dataset(roots, out, release, rate)
+    report = reduce_dataset(roots, out, **options)
     click.echo(report.to_text())
     if report.skipped:
         raise SystemExit(entry.FAILED)

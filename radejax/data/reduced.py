@@ -183,9 +183,8 @@ def _bins_of_points(
     x, y, z = xyz = points[:, :3].T
     axes = grid.range_m, grid.azimuth_rad, grid.elevation_rad
     sizes = np.reshape([axis.size for axis in axes], (3, 1))
-    if points.shape[1] == 11:
-        stored = points[:, 8:].T
-    else:
+    stored = points[:, 8:].T
+    if points.shape[1] == 5:
         ground = np.hypot(x, y)
         polar = np.hypot(ground, z), -np.arctan2(y, x), -np.arctan2(z, ground)
         pairs = zip(polar, axes, strict=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Sequence
 from typing import Any
 
 from ml_collections import ConfigDict
@@ -147,21 +146,15 @@ def _check_pairs(config: ConfigDict) -> None:
         require(best in known, "config.train.best_metric", best, f"one of {known}")
 
 
-def check_bins(
-    model: ConfigDict,
-    grid: RadarGrid,
-    source: str,
-    axes: Sequence[str] = ("doppler", "elevation"),
-) -> None:
+def check_bins(model: ConfigDict, grid: RadarGrid, source: str) -> None:
     """Raises `UserError` if the Doppler or elevation bins of a model and a grid differ.
 
     Args:
         model: The section `config.model`.
         grid: Grid of the radar.
         source: Description of the radar for the error message.
-        axes: Axes to check.
     """
-    for name in axes:
+    for name in ("doppler", "elevation"):
         bins, expected = model[f"{name}_bins"], getattr(grid, f"num_{name}")
         text = f"{expected}, as {source} has"
         require(bins == expected, f"config.model.{name}_bins", bins, text)
@@ -175,9 +168,9 @@ def _check_simulation(config: ConfigDict) -> None:
     ):  # not "kradar" and no fields of a RadarGrid
         check_options(config.simulation.grid, "config.simulation.grid", _GRID)
     grid = SimulationConfig.from_mapping(config.simulation).make_grid()
-    # Frames of a reduced release can be read without their Doppler.
-    axes = ("doppler", "elevation") if config.model.doppler_bins else ("elevation",)
-    check_bins(config.model, grid, "config.simulation.grid", axes)
+    if not config.model.doppler_bins and grid.num_elevation:
+        grid = grid.without_doppler()  # as frames of a reduced release can be read
+    check_bins(config.model, grid, "config.simulation.grid")
 
 
 def _check_fields(config: ConfigDict) -> None:

@@ -13,7 +13,7 @@ from tqdm import tqdm
 from radejax.core.errors import DataError, require
 from radejax.core.files import PathLike, as_path, atomic_write
 from radejax.data.kradar.dataset import find_sequences, read_grid
-from radejax.data.records import PreprocessReport
+from radejax.data.records import PreprocessReport, describe_grid
 from radejax.data.reduced import reduce_tensor, strongest_points
 from radejax.data.tesseract import project_file, read_tesseract
 
@@ -42,9 +42,8 @@ def reduce_dataset(
     require(0 < rate < 1, "rate", rate, "a number above 0 and below 1")
     began, out, paths = time.perf_counter(), as_path(out), list(map(as_path, roots))
     grid, targets = read_grid(paths), {}
-    sizes = f"{grid.num_doppler} Doppler and {grid.num_elevation} elevation bins"
-    is_4d = grid.num_doppler > 1 and grid.num_elevation > 0
-    require(is_4d, "the radar", sizes, "Doppler and elevation")
+    least = min(grid.num_doppler - 1, grid.num_elevation)
+    require(least > 0, "the radar's grid", describe_grid(grid), "four axes")
     for root in paths:
         shutil.copytree(root, out, False, _LEFT_OUT, _link, dirs_exist_ok=True)
     for folder in find_sequences(paths).values():
