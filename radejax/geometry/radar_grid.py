@@ -53,7 +53,12 @@ class ArrayValues:
 
 
 def is_uniform(axis: Float[np.ndarray, " bins"]) -> bool:
-    """Returns whether the bin centers of an axis have equal distances, up to 0.1 %."""
+    """Returns whether the bin centers of an axis have equal distances, up to 0.1 %.
+
+    Examples:
+        >>> is_uniform(np.arange(5.0)), is_uniform(np.sin(np.arange(5.0) / 5))
+        (True, False)
+    """
     if axis.size < 3:
         return True
     even = np.linspace(axis[0], axis[-1], axis.size)
@@ -64,6 +69,10 @@ def values_at(axis: Float[np.ndarray, " bins"], position: Positions) -> Any:
     """Returns the values of an axis at fractional bins, which may be outside of it.
 
     They are linear between adjacent centers, and continue with the first and last step.
+
+    Examples:
+        >>> values_at(np.array([1.0, 2.0, 4.0]), np.array([-1.0, 1.5, 3.0])).tolist()
+        [0.0, 3.0, 6.0]
     """
     if is_uniform(axis):
         return axis[0] + position * _step(axis)

@@ -87,6 +87,7 @@ def test_the_config_is_complete() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("one_device")
 def test_a_simulated_recording_is_trained_evaluated_and_drawn(
     tmp_path: pathlib.Path,
 ) -> None:
