@@ -18,7 +18,8 @@ The argument is a list of options, at most one of each group:
 - classes: `all` (default; five classes, v2.1 labels) or `sedan` (v1.1 labels).
 - release: `polar3d` or `rpc`, as in `radenet.py`.
 
-Table 4 reports (Sedan AP of the five-class models, narrow region, IoU 0.3):
+Table 4 reports (Sedan AP of the five-class models, without the option `sedan`, narrow region,
+IoU 0.3):
 
 | variant | AP 3D | AP BEV |
 |---|---|---|

@@ -20,7 +20,7 @@ The argument is a list of options, at most one of each group:
   point, and scaled as in `quickstart.py`, because the noise is almost constant.
   `--config.model.doppler_bins=0` leaves out the reconstructed Doppler half.
 
-Table III reports (Sedan, narrow region, IoU 0.3):
+Table III reports (models with the option `sedan`, narrow region, IoU 0.3):
 
 | variant | AP 3D | AP BEV |
 |---|---|---|

@@ -28,7 +28,7 @@ _new_root = click.option(
     "--frames",
     "frames_per_sequence",
     type=click.IntRange(0),
-    help="Frames per sequence; 0 = all labelled frames.",
+    help="Frames per sequence, of both splits with --scenes; 0 = all labelled frames.",
 )
 @click.option(
     "--full-size", is_flag=True, help="K-Radar's own grid and images of 2560 x 720."

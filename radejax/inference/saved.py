@@ -77,7 +77,8 @@ class SavedModel:
     @property
     def model(self) -> nn.Module:
         """The Flax module, without parameters."""
-        return models.build(self.config.model)
+        # Runs of earlier versions have no `num_frames`.
+        return models.build(self.config.model, self.config.data.get("num_frames", 1))
 
 
 def load_model(

@@ -145,7 +145,7 @@ class DinoRade(RadeNet, kw_only=True):
                 f"{'image' if image is None else 'camera'}: give both or none"
             )
         x = self._features(padded)
-        elevation = padded[..., self.doppler_bins :]
+        elevation = padded[..., -self.elevation_bins :]  # of the last frame
         x = self.image_fusion(x, elevation, camera_map, reference, train=train)
         return self._maps(x, projection)
 

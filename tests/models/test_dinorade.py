@@ -12,6 +12,7 @@ import pytest
 
 from radejax.core.config import load_module
 from radejax.core.errors import UserError
+from radejax.data.projection import stack_frames
 from radejax.geometry.camera import stack_cameras
 from radejax.models import build, lifting
 from radejax.models.lifting import ReferencePoints
@@ -79,6 +80,31 @@ def test_radar_parts_have_the_names_of_radenet():
     shapes = jax.eval_shape(radar.init, jax.random.key(0), batch()[0])["params"]
     ours = {k: variables["params"][k] for k in ("backbone", "neck", "heads")}
     chex.assert_trees_all_equal_shapes(ours, shapes)
+
+
+def test_elevation_weights_are_those_of_the_last_frame():
+    detector = small_models.detector("camera", num_frames=2)
+    model, variables = detector.model, detector.variables
+    image = jnp.asarray(small_models.images(1))
+    camera = stack_cameras([calibration().camera()])
+
+    @jax.jit
+    def apply(stacked):
+        inputs = stacked[None], image, camera
+        _, found = model.apply(variables, *inputs, capture_intermediates=True)
+        found = found["intermediates"]
+        weights = found["image_fusion"]["weighting"]["__call__"][0]
+        return weights, found["backbone"]["__call__"][0]
+
+    def weighting(*frames):
+        return apply(stack_frames(frames, model.doppler_bins))
+
+    a, b, c = small_models.projections(3)
+    weights, features = weighting(a, b)
+    other_weights, other_features = weighting(c, b)
+    np.testing.assert_array_equal(weights, other_weights)
+    assert np.abs(features - other_features).max() > 1e-3
+    assert np.abs(weighting(a, c)[0] - weights).max() > 1e-3
 
 
 def test_the_camera_changes_the_prediction_and_each_frame_uses_its_own():
