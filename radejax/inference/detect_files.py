@@ -96,6 +96,7 @@ def front_images(
     detector: Detector,
     labels: str | os.PathLike | None = None,
     version: str = "v2.1",
+    roots: Sequence[str | os.PathLike] = (),
 ) -> dict[pathlib.Path, tuple[pathlib.Path, Camera]]:
     """Find the images and cameras of frames.
 
@@ -105,6 +106,8 @@ def front_images(
         labels: Label revision, see `KRadar`. If None, the label files of the sequences
             are used, and sequences without them have no images.
         version: Version of the labels.
+        roots: Files and folders in which `find_frames` searched. Folders of sequences
+            without radar files may have their images and labels.
 
     Returns:
         Image file and camera by the path of the radar file, for the frames that have both.
@@ -113,16 +116,21 @@ def front_images(
         UserError: The labels are of another version, or a calibration is for images of
             another size than the model's.
     """
+    others = {
+        files.as_path(root).absolute() for root in roots if files.as_path(root).is_dir()
+    }
+    others = {root for root in others if any(map(sequence_number, root.iterdir()))}
+    others -= {_sequence(path).parent for path in paths}
     sequences = [
         folder
         for folder in {_sequence(path) for path in paths}
         if sequence_number(folder) is not None
-        and (labels or any(folder.glob("info_label*")))
+        and (labels or others or any(folder.glob("info_label*")))
     ]
     if not sequences:
         return {}
     frames = KRadar(
-        sorted({folder.parent for folder in sequences}),
+        sorted({folder.parent for folder in sequences}) + sorted(others),
         labels,
         version=version,
         visibility=None,
@@ -267,7 +275,7 @@ def _files(
     known: dict[pathlib.Path, tuple[pathlib.Path, Camera]] = {}
     if detector.takes_camera:
         labels = labels or data.labels
-        known = front_images(frames, detector, labels, data.label_version)
+        known = front_images(frames, detector, labels, data.label_version, paths)
     if not known:
         return keys, lambda batch: frames[batch]
     images = [known.get(path.absolute(), (None, None)) for path in frames]

@@ -3,6 +3,7 @@
 import json
 import pathlib
 import zipfile
+from types import SimpleNamespace
 from typing import Any
 
 import click.testing
@@ -12,7 +13,9 @@ import pytest
 from radejax import Detector, KRadar, models
 from radejax.cli import figures, main
 from radejax.core.errors import DataError
+from radejax.data.cameras import CameraOptions
 from radejax.data.records import Records
+from radejax.inference.detect_files import find_frames, front_images
 from radejax.inference.saved import SavedModel, save_model
 from radejax.simulation.config import default_config
 from radejax.simulation.dataset import simulate_dataset
@@ -130,6 +133,20 @@ def test_boxes_are_found_in_files_and_arrays(
         np.testing.assert_array_equal(detector(np.stack(arrays)).boxes, expected)
     with pytest.raises(DataError, match=r"^frame: "):
         detector([arrays[0] * 1e13])
+
+
+def test_images_on_another_disk_are_found(disks: Any) -> None:
+    _, roots, labels = disks
+    paths = find_frames(roots)
+    assert len(paths) == 12
+    model = SimpleNamespace(image_size=(180, 320))
+    detector: Any = SimpleNamespace(model=model, camera_options=CameraOptions())
+    found = front_images(paths, detector, labels, roots=roots)
+    assert set(found) == set(paths)
+    for path, (image, camera) in found.items():
+        assert image.parents[1] == roots[1] / path.parent.name
+        assert camera.is_valid
+    assert not front_images(paths, detector, roots=roots[:1])
 
 
 def test_other_roots_are_wrong_use(
