@@ -192,7 +192,7 @@ def reduce(roots: tuple[str, ...], out: pathlib.Path, **options: Any) -> None:
     "--image-backbone",
     required=True,
     type=entry.EXISTING,
-    help="DINOv3 folder from Hugging Face, or torchvision's ResNet-50 file.",
+    help="DINOv3 (folder or file), DINOv2 folder, or torchvision's ResNet-50 file.",
 )
 @click.option(
     "--out", required=True, type=entry.FOLDER, help="Folder of the embeddings."
