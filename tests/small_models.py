@@ -26,6 +26,19 @@ def small_grid() -> RadarGrid:
     )
 
 
+def uneven_grid(**axes: np.ndarray) -> RadarGrid:
+    """A radar without elevation, uniform in sin(azimuth) and log(range), or other axes."""
+    fields = {
+        "range_m": np.geomspace(2.0, 30.0, 16),
+        "azimuth_rad": np.arcsin(np.linspace(-0.8, 0.8, 14)),
+        "elevation_rad": np.array([]),
+        "doppler_mps": np.linspace(-4.0, 4.0, 4, endpoint=False),
+        "fov_range_m": 30.0,
+        "fov_azimuth_rad": 0.9,
+    }
+    return RadarGrid(**(fields | axes))
+
+
 def _shrink(config: ConfigDict) -> ConfigDict:
     config.model.update(
         doppler_bins=2,

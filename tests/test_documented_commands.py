@@ -139,7 +139,7 @@ def _check_train(arguments: list[str]) -> None:
         return
     pairs = zip(["", *arguments], arguments, strict=False)
     arguments = [word for old, word in pairs if word != "..." or old == "--config"]
-    own = ("...", "own.py")  # configs of the reader
+    own = ("...", "own_radar.py")  # configs of the reader
     names = ["radenet" if word in own else word for word in arguments]
     context = click.Context(train, **train.context_settings)
     with pytest.MonkeyPatch.context() as patch:

@@ -1,4 +1,4 @@
-"""Commands that prepare datasets: `simulate`, `data check`, `preprocess` and `embed`."""
+"""Commands that prepare datasets: from `simulate` and `data check` to `embed`."""
 
 from __future__ import annotations
 
@@ -11,14 +11,16 @@ import radejax
 from radejax.cli import entry
 from radejax.core.errors import UserError
 
+_new_root = click.option(
+    "--out", required=True, type=entry.FOLDER, help="Root of the new dataset."
+)
+
 
 @click.command(cls=entry.Command)
 @click.option(
     "--config", help="Config with a `simulation` section. Default: a small dataset."
 )
-@click.option(
-    "--out", required=True, type=entry.FOLDER, help="Root of the new dataset."
-)
+@_new_root
 @click.option("--seed", type=click.IntRange(0), help="Replaces the config's seed.")
 @click.option("--scenes", help='"procedural", or a label folder or zip of K-Radar.')
 @entry.sequences
@@ -143,6 +145,38 @@ def preprocess(
     report = records.preprocess(
         frames, out, dtype=dtype, shard=shard, num_workers=num_workers
     )
+    click.echo(report.to_text())
+    if report.skipped:
+        raise SystemExit(entry.FAILED)
+
+
+@click.command(cls=entry.Command)
+@entry.roots
+@_new_root
+@click.option(
+    "--to",
+    "release",
+    required=True,
+    type=click.Choice(["polar3d", "rpc"]),
+    help="polar3d: mean power and Doppler of every cell. rpc: the strongest cells.",
+)
+@click.option(
+    "--rate",
+    type=entry.FRACTION,
+    default=0.01,
+    help="Fraction of the cells (rpc only).",
+)
+def reduce(roots: tuple[str, ...], out: pathlib.Path, **options: Any) -> None:
+    """Write the files of K-Radar's reduced releases from radar tensors.
+
+    The other files of ROOTS become symbolic links. Run again, it writes only missing files.
+    Tensors that are corrupted are skipped and listed, with exit code 1.
+
+    Example: radejax reduce /disk1/kradar --to rpc --rate 0.01 --out /fast/points
+    """
+    from radejax.data.kradar.reduce import reduce_dataset
+
+    report = reduce_dataset(roots, out, **options)
     click.echo(report.to_text())
     if report.skipped:
         raise SystemExit(entry.FAILED)

@@ -164,7 +164,8 @@ def view(
     shown = complete[:max_frames]
     detector = None if workdir is None else radejax.Detector.from_workdir(workdir)
     bar = tqdm.tqdm(shown, desc="record", unit="frame")
-    write_recording(viewer_scenes(bar, frames.grid, detector), out)
+    grid = frames.grid if detector is None else detector.grid
+    write_recording(viewer_scenes(bar, grid, detector), out)
     text = f"{len(shown)} frames written to {out}"
     if lacking := len(frames) - len(complete):
         text += f"; {lacking} without radar tensor or projection skipped"

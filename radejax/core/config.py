@@ -176,9 +176,9 @@ _FIELDS: dict[str, Any] = {
         "name": "radenet",
         # Number of classes; must equal the length of `classes`.
         "num_classes": len(CLASSES),
-        # Doppler bins of the radar.
+        # Doppler bins of the radar; 0 without Doppler.
         "doppler_bins": 64,
-        # Elevation bins of the radar.
+        # Elevation bins of the radar; 0 without elevation.
         "elevation_bins": 37,
         # Channels of the encoder levels, finest first.
         "widths": (128, 256, 512),

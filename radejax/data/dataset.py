@@ -159,9 +159,12 @@ class LabelledFrames(Sequence[_F]):
         reader_version: Text that a reader changes when it computes other projections from
             the same files; records of another version are not used. None if neither the
             reader nor the files change, which are then not compared with their records.
+        release: Reduced release from which the projections are computed (one of
+            `radejax.data.reduced.RELEASES`), or None.
     """
 
     reader_version: str | None = ""
+    release: str | None = None
 
     def __init__(
         self,

@@ -22,9 +22,10 @@ class Points(NamedTuple):
     """Radar points as columns of equal length, by descending power.
 
     Attributes:
-        x_m, y_m, z_m: Position in the radar frame: forward, left and up from the radar.
-        doppler_mps: Doppler velocity of the strongest Doppler bin.
-        power_db: Power of the strongest Doppler bin.
+        x_m, y_m, z_m: Position in the radar frame: forward, left and up from the radar;
+            at elevation 0 if the radar does not measure it.
+        doppler_mps: Doppler velocity of the strongest Doppler bin, or NaN without Doppler.
+        power_db: Power of the strongest Doppler (or elevation) bin.
     """
 
     x_m: Float[np.ndarray, " N"]
@@ -58,19 +59,24 @@ def cfar_points(
         Cell averaging: Richards, Fundamentals of Radar Signal Processing, ch. 6.
     """
     doppler, elevation = np.split(projection, [grid.num_doppler], axis=-1)
-    power_db = doppler.max(-1) * LOG_SCALE_DB - LOG_OFFSET_DB
+    strongest = (doppler if grid.num_doppler else elevation).max(-1)
+    power_db = strongest * LOG_SCALE_DB - LOG_OFFSET_DB
     mean_db = local_mean_db(power_db, guard_cells, training_cells)
     r, a = np.nonzero(power_db - mean_db > threshold_db)
     order = np.argsort(-power_db[r, a], kind="stable")
     r, a = r[order], a[order]
     azimuth_rad = grid.azimuth_rad[a]
-    elevation_rad = grid.elevation_rad[elevation[r, a].argmax(-1)]
+    elevation_rad, doppler_mps = np.zeros(r.size), np.full(r.size, np.nan)
+    if grid.num_elevation:
+        elevation_rad = grid.elevation_rad[elevation[r, a].argmax(-1)]
+    if grid.num_doppler:
+        doppler_mps = grid.doppler_mps[doppler[r, a].argmax(-1)]
     ground_m = grid.range_m[r] * np.cos(elevation_rad)
     return Points(
         x_m=ground_m * np.cos(azimuth_rad),
         y_m=-ground_m * np.sin(azimuth_rad),
         z_m=grid.range_m[r] * np.sin(elevation_rad),
-        doppler_mps=grid.doppler_mps[doppler[r, a].argmax(-1)],
+        doppler_mps=doppler_mps,
         power_db=power_db[r, a],
     )
 

@@ -32,7 +32,7 @@ from radejax.core.errors import DataError, UserError, require
 from radejax.core.workers import process_pool
 from radejax.data.dataset import FrameSequence, LabelledFrame, LabelledFrames
 from radejax.data.projection import ENCODINGS, encode
-from radejax.geometry.radar_grid import RadarGrid
+from radejax.geometry.radar_grid import RadarGrid, is_uniform
 
 _log = logging.getLogger(__name__)
 
@@ -50,8 +50,8 @@ class Records:
         shape: Shape of every array.
         dtype: Type of every array: "float16", "float32" or "uint8".
         source: JSON values that describe how the records were created: the radar "grid"
-            for projections; the configuration and weights of the backbone for
-            embeddings.
+            for projections, and the "release" if it is a reduced one; the configuration
+            and weights of the backbone for embeddings.
     """
 
     folder: pathlib.Path
@@ -243,11 +243,13 @@ def embedding_fields(image_config: Mapping[str, Any]) -> dict[str, Any]:
 
 def describe_grid(grid: RadarGrid) -> str:
     """Returns a short description of the size and extent of a grid."""
-    sizes = " x ".join(map(str, grid.shape_drea))
+    axes = grid.doppler_mps, grid.range_m, grid.elevation_rad, grid.azimuth_rad
+    sizes = " x ".join(str(axis.size) for axis in axes)
+    is_even = is_uniform(grid.range_m) and is_uniform(grid.azimuth_rad)
     return (
         f"{sizes} bins (Doppler, range, elevation, azimuth) to {grid.range_m[-1]:.2f} m, "
         f"azimuth {np.rad2deg(grid.azimuth_rad[0]):.1f} to "
-        f"{np.rad2deg(grid.azimuth_rad[-1]):.1f} deg"
+        f"{np.rad2deg(grid.azimuth_rad[-1]):.1f} deg{'' if is_even else ', not uniform'}"
     )
 
 
@@ -332,6 +334,8 @@ def preprocess(
     if frames.reader_version is not None:
         name = f"{type(frames).__module__}:{type(frames).__qualname__}"
         source["reader"] = [name, frames.reader_version]
+    if frames.release is not None:
+        source["release"] = frames.release
     records = Records.create(folder, grid.projection_shape, dtype, source)
     keys, mine = records.keys(), list(frames)[index::count]
     if frames.reader_version is not None:

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Float, Int, Real
 from radejax.core.errors import require
 from radejax.geometry.boxes import array_module, as_floats
 
-_AXES = ("range_m", "azimuth_rad", "elevation_rad", "doppler_mps")
+_LEAST_BINS = {"range_m": 2, "azimuth_rad": 2, "elevation_rad": 0, "doppler_mps": 0}
 _MAX_VALUE = 10_000.0  # larger than any value on a radar's axes
 
 AzimuthMapping = Literal["true", "stretched"]
@@ -52,25 +52,74 @@ class ArrayValues:
         return hash(self._key())
 
 
+def is_uniform(axis: Float[np.ndarray, " bins"]) -> bool:
+    """Returns whether the bin centers of an axis have equal distances, up to 0.1 %.
+
+    Examples:
+        >>> is_uniform(np.arange(5.0)), is_uniform(np.sin(np.arange(5.0) / 5))
+        (True, False)
+    """
+    if axis.size < 3:
+        return True
+    even = np.linspace(axis[0], axis[-1], axis.size)
+    return bool(np.abs(axis - even).max() <= 1e-3 * abs(_step(axis)))
+
+
+def values_at(axis: Float[np.ndarray, " bins"], position: Positions) -> Any:
+    """Returns the values of an axis at fractional bins, which may be outside of it.
+
+    They are linear between adjacent centers, and continue with the first and last step.
+
+    Examples:
+        >>> values_at(np.array([1.0, 2.0, 4.0]), np.array([-1.0, 1.5, 3.0])).tolist()
+        [0.0, 3.0, 6.0]
+    """
+    if is_uniform(axis):
+        return axis[0] + position * _step(axis)
+    return _interpolated(position, np.arange(axis.size), axis)
+
+
+def _step(axis: Float[np.ndarray, " bins"]) -> float:
+    return float((axis[-1] - axis[0]) / (axis.size - 1))
+
+
+def _interpolated(x: Any, xs: np.ndarray, ys: np.ndarray) -> Any:
+    """Evaluates the lines through adjacent points (xs, ys), where xs is monotonic."""
+    xp = array_module(x)
+    if xs[0] > xs[-1]:
+        xs, ys = xs[::-1], ys[::-1]
+    left = xp.searchsorted(xp.asarray(xs), x, side="right") - 1
+    left = xp.clip(left, 0, xs.size - 2)
+    tables = xs, ys, np.diff(ys) / np.diff(xs)
+    start, value, slope = (xp.asarray(table)[left] for table in tables)
+    return value + (x - start) * slope
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class RadarGrid(ArrayValues):
-    """Bin centers of a 4D radar tensor on four uniform, increasing axes.
+    """Bin centers of a radar tensor on up to four monotonic axes.
 
     Azimuth is positive to the right of boresight, `azimuth = -atan2(y, x)`, as in
-    K-Radar. Doppler is the aliased radial velocity. Grids compare and hash by value,
+    K-Radar. Doppler is the aliased radial velocity. Bins may have different widths, such
+    as those of azimuths that are uniform in sin(azimuth). Grids compare and hash by value,
     so they can be static arguments of jitted functions.
 
+    Without elevation or Doppler, that axis is empty: it has one bin in tesseracts and no
+    channel in projections.
+
     Attributes:
-        range_m: `[R]` ranges in meters.
+        range_m: `[R]` ranges in meters, increasing.
         azimuth_rad: `[A]` azimuths in radians.
-        elevation_rad: `[E]` elevations in radians.
-        doppler_mps: `[D]` radial velocities in meters per second.
+        elevation_rad: `[E]` elevations in radians; empty if they are not measured.
+        doppler_mps: `[D]` radial velocities in meters per second; empty if they are not
+            measured.
         fov_range_m: Maximum range of the field of view in meters.
         fov_azimuth_rad: Maximum absolute azimuth of the field of view in radians.
 
     Raises:
-        ValueError: An axis has fewer than 2 bins, is not uniform and increasing, or has a
-            value above 10,000; or a limit of the field of view is not in (0, 10,000].
+        ValueError: Range or azimuth has fewer than 2 bins, elevation and Doppler are both
+            empty, an axis is not monotonic or has a value above 10,000, ranges decrease,
+            or a limit of the field of view is not in (0, 10,000].
 
     References:
         Sensor axes: Paek et al., K-Radar, arXiv:2206.08171.
@@ -84,18 +133,25 @@ class RadarGrid(ArrayValues):
     fov_azimuth_rad: float
 
     def __post_init__(self) -> None:
-        for name in _AXES:
+        for name, least in _LEAST_BINS.items():
             axis = self.freeze(name)
-            if axis.ndim != 1 or axis.size < 2:
+            if axis.ndim != 1 or axis.size < least:
                 raise ValueError(
-                    f"{name} must be a vector of at least 2 bins, got shape {axis.shape}"
+                    f"{name} must be a vector of at least {least} bins, got shape "
+                    f"{axis.shape}"
                 )
             if not (np.abs(axis) <= _MAX_VALUE).all():
                 raise ValueError(f"{name} must be finite, got {axis}")
-            step = (axis[-1] - axis[0]) / (axis.size - 1)
-            deviation = np.abs(axis - (axis[0] + step * np.arange(axis.size))).max()
-            if not step > 0 or deviation > 1e-3 * step:
-                raise ValueError(f"{name} must be uniform and increasing, got {axis}")
+            steps, kind = np.diff(axis), "increasing"
+            if name != "range_m":
+                steps *= np.sign(axis[-1:] - axis[:1])
+                kind = "increasing or decreasing"
+            if not (steps > 0).all():
+                raise ValueError(f"{name} must be {kind}, got {axis}")
+        if not self.num_elevation + self.num_doppler:
+            raise ValueError(
+                "elevation_rad and doppler_mps are both empty, expected at least one bin"
+            )
         for name in ("fov_range_m", "fov_azimuth_rad"):
             value = getattr(self, name)
             if not 0 < value <= _MAX_VALUE:
@@ -131,17 +187,16 @@ class RadarGrid(ArrayValues):
         """Returns a coarser grid with axes like K-Radar's, for tests and quick starts.
 
         Range starts at 0, azimuth and elevation are symmetric, and Doppler covers
-        `[-max, max)` like the output of an FFT.
+        `[-max, max)` like the output of an FFT. A single elevation or Doppler is 0.
         """
         azimuth = np.deg2rad(max_azimuth_deg)
-        elevation = np.deg2rad(max_elevation_deg)
+        elevation = np.deg2rad(max_elevation_deg) if num_elevation > 1 else 0.0
+        doppler = max_doppler_mps if num_doppler > 1 else 0.0
         return cls(
             range_m=np.linspace(0.0, max_range_m, num_range),
             azimuth_rad=np.linspace(-azimuth, azimuth, num_azimuth),
             elevation_rad=np.linspace(-elevation, elevation, num_elevation),
-            doppler_mps=np.linspace(
-                -max_doppler_mps, max_doppler_mps, num_doppler, endpoint=False
-            ),
+            doppler_mps=np.linspace(-doppler, doppler, num_doppler, endpoint=False),
             fov_range_m=float(max_range_m),
             fov_azimuth_rad=float(azimuth),
         )
@@ -168,17 +223,22 @@ class RadarGrid(ArrayValues):
                 span the unpadded field of view, and the last range bin lies at the
                 nominal maximum range. This displaces targets by up to 5 columns from the
                 data; use it only for official checkpoints, which were trained with it.
+
+        Raises:
+            UserError: The mapping is unknown, or "stretched" for axes that are not uniform.
         """
         num_range = -(-self.num_range // multiple) * multiple
         num_azimuth = -(-self.num_azimuth // multiple) * multiple
         kinds = get_args(AzimuthMapping)
         known = azimuth_mapping in kinds
         require(known, "azimuth_mapping", azimuth_mapping, " or ".join(kinds))
-        first, last = self.azimuth_rad[0], self.azimuth_rad[-1]
         if azimuth_mapping == "true":
-            range_m = self.range_m[0] + self.range_step_m * np.arange(num_range)
-            azimuth = first + self.azimuth_step_rad * np.arange(num_azimuth)
+            range_m = values_at(self.range_m, np.arange(num_range))
+            azimuth = values_at(self.azimuth_rad, np.arange(num_azimuth))
         else:
+            even = is_uniform(self.range_m) and is_uniform(self.azimuth_rad)
+            require(even, "azimuth_mapping", azimuth_mapping, "true for uneven axes")
+            first, last = self.azimuth_rad[0], self.azimuth_rad[-1]
             range_m = np.linspace(self.range_m[0], self.fov_range_m, num_range)
             azimuth = np.linspace(first, last, num_azimuth)
         return dataclasses.replace(self, range_m=range_m, azimuth_rad=azimuth)
@@ -204,7 +264,8 @@ class RadarGrid(ArrayValues):
     @property
     def shape_drea(self) -> tuple[int, int, int, int]:
         """Shape of a tesseract: Doppler, range, elevation, azimuth."""
-        return self.num_doppler, self.num_range, self.num_elevation, self.num_azimuth
+        doppler, elevation = max(self.num_doppler, 1), max(self.num_elevation, 1)
+        return doppler, self.num_range, elevation, self.num_azimuth
 
     @property
     def projection_shape(self) -> tuple[int, int, int]:
@@ -213,12 +274,33 @@ class RadarGrid(ArrayValues):
 
     @property
     def range_step_m(self) -> float:
-        return float((self.range_m[-1] - self.range_m[0]) / (self.num_range - 1))
+        """Mean distance of adjacent ranges."""
+        return _step(self.range_m)
 
     @property
     def azimuth_step_rad(self) -> float:
-        span = self.azimuth_rad[-1] - self.azimuth_rad[0]
-        return float(span / (self.num_azimuth - 1))
+        """Mean difference of adjacent azimuths, below 0 if they decrease."""
+        return _step(self.azimuth_rad)
+
+    @property
+    def range_widths_m(self) -> float | Float[np.ndarray, " R"]:
+        """Width of all range bins, or of each if ranges are not uniform."""
+        if is_uniform(self.range_m):
+            return self.range_step_m
+        return np.gradient(self.range_m)
+
+    def without_doppler(self) -> RadarGrid:
+        """Returns the grid without its Doppler axis."""
+        return dataclasses.replace(self, doppler_mps=np.array([]))
+
+    def measured_channels(
+        self, projection: Float[Any, "*bins DE"]
+    ) -> Float[Any, "*bins _"]:
+        """Returns the channels of a tesseract's projection that are not of an empty axis."""
+        shape = self.shape_drea
+        if self.projection_shape[2] == shape[0] + shape[2]:
+            return projection
+        return projection[..., 1:] if self.num_elevation else projection[..., :-1]
 
     # Bins and meters -----------------------------------------------------------------
 
@@ -227,8 +309,8 @@ class RadarGrid(ArrayValues):
     ) -> Float[Any, "*bins 2"]:
         """Returns the positions of range-azimuth bins on the ground plane of the ego frame.
 
-        Bin (i, j) lies at range r = r0 + i dr and azimuth a = a0 + j da, hence at
-        x = r cos(a), y = -r sin(a).
+        Bin (i, j) lies at range r = r0 + i dr and azimuth a = a0 + j da on uniform axes,
+        hence at x = r cos(a), y = -r sin(a). See `values_at` for other axes.
 
         Args:
             range_bin: Position along range in bins, `[...]`; may be fractional.
@@ -239,8 +321,8 @@ class RadarGrid(ArrayValues):
             or Python input, else a JAX array.
         """
         xp, range_bin, azimuth_bin = as_floats(range_bin, azimuth_bin)
-        range_m = self.range_m[0] + range_bin * self.range_step_m
-        azimuth = self.azimuth_rad[0] + azimuth_bin * self.azimuth_step_rad
+        range_m = values_at(self.range_m, range_bin)
+        azimuth = values_at(self.azimuth_rad, azimuth_bin)
         return xp.stack([range_m * xp.cos(azimuth), -range_m * xp.sin(azimuth)], -1)
 
     def ego_to_bin(self, x_m: Positions, y_m: Positions) -> Float[Any, "*bins 2"]:
@@ -250,18 +332,20 @@ class RadarGrid(ArrayValues):
             `[..., 2]` range and azimuth in bins, not clipped to the grid.
         """
         xp, x_m, y_m = as_floats(x_m, y_m)
+        range_m, azimuth = xp.sqrt(x_m * x_m + y_m * y_m), -xp.arctan2(y_m, x_m)
         # The order of operations decides in which direction exact half bins are rounded.
         # This order gives the bins of the released code. Azimuth is measured from the
         # middle of the axis, so that a point straight ahead lies exactly in the middle
         # even in float32.
-        last_range, last_azimuth = self.num_range - 1, self.num_azimuth - 1
-        range_span = float(self.range_m[-1] - self.range_m[0])
-        azimuth_span = float(self.azimuth_rad[-1] - self.azimuth_rad[0])
-        azimuth_mid = float(self.azimuth_rad[-1] + self.azimuth_rad[0]) / 2
-        range_m = xp.sqrt(x_m * x_m + y_m * y_m) - float(self.range_m[0])
-        azimuth = -xp.arctan2(y_m, x_m) - azimuth_mid
-        range_bin = range_m * last_range / range_span
-        azimuth_bin = azimuth * last_azimuth / azimuth_span + last_azimuth / 2
+        axis, last = self.range_m, self.num_range - 1
+        range_bin = (range_m - float(axis[0])) * last / float(axis[-1] - axis[0])
+        if not is_uniform(axis):
+            range_bin = _interpolated(range_m, axis, np.arange(axis.size))
+        axis, last = self.azimuth_rad, self.num_azimuth - 1
+        span, middle = float(axis[-1] - axis[0]), float(axis[-1] + axis[0]) / 2
+        azimuth_bin = (azimuth - middle) * last / span + last / 2
+        if not is_uniform(axis):
+            azimuth_bin = _interpolated(azimuth, axis, np.arange(axis.size))
         return xp.stack([range_bin, azimuth_bin], -1)
 
     def nearest_bin(self, x_m: Positions, y_m: Positions) -> Int[Any, "*bins 2"]:

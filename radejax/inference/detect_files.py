@@ -27,12 +27,13 @@ from radejax.data.kradar import KRadar
 from radejax.data.kradar.conditions import check_weather, read_description
 from radejax.data.kradar.dataset import sequence_number
 from radejax.data.pipeline import camera_inputs, frame_histories, require_images
+from radejax.data.reduced import is_reduced_file
 from radejax.evaluation import kitti
 from radejax.geometry.camera import Camera
 from radejax.inference.detector import Detector
 from radejax.inference.saved import Step
 
-PATTERNS = ("tesseract_*.mat", "DERA_tesseract_*.npy")
+PATTERNS = ("tesseract_*.mat", "DERA_tesseract_*.npy", "polar3d_*.npy", "rpc_*.npy")
 """Patterns of the names of radar files."""
 
 
@@ -41,7 +42,7 @@ def find_frames(
     sequence_numbers: Sequence[int] | None = None,
     weather: Sequence[str] | None = None,
 ) -> list[pathlib.Path]:
-    """Find tesseract and projection files in files and folders.
+    """Find radar files in files and folders.
 
     If a frame has both files, only the projection is returned.
 
@@ -86,7 +87,8 @@ def find_frames(
 
 
 def _sequence(path: pathlib.Path) -> pathlib.Path:
-    return path.absolute().parent.parent
+    folder = path.absolute().parent
+    return folder if is_reduced_file(path) else folder.parent
 
 
 def front_images(
@@ -95,6 +97,7 @@ def front_images(
     labels: str | os.PathLike | None = None,
     version: str = "v2.1",
     camera_calibration: str | os.PathLike | None = None,
+    roots: Sequence[str | os.PathLike] = (),
 ) -> dict[pathlib.Path, tuple[pathlib.Path, Camera]]:
     """Find the images and cameras of frames.
 
@@ -105,6 +108,8 @@ def front_images(
             are used, and sequences without them have no images.
         version: Version of the labels.
         camera_calibration: Folder of camera calibrations; None for those in the roots.
+        roots: Files and folders in which `find_frames` searched. Folders of sequences
+            without radar files may have their images and labels.
 
     Returns:
         Image file and camera by the path of the radar file, for the frames that have both.
@@ -113,16 +118,21 @@ def front_images(
         UserError: The labels are of another version, there are images and no calibration,
             or a calibration is for images of another size than the model's.
     """
+    others = {
+        files.as_path(root).absolute() for root in roots if files.as_path(root).is_dir()
+    }
+    others = {root for root in others if any(map(sequence_number, root.iterdir()))}
+    others -= {_sequence(path).parent for path in paths}
     sequences = [
         folder
         for folder in {_sequence(path) for path in paths}
         if sequence_number(folder) is not None
-        and (labels or any(folder.glob("info_label*")))
+        and (labels or others or any(folder.glob("info_label*")))
     ]
     if not sequences:
         return {}
     frames = KRadar(
-        sorted({folder.parent for folder in sequences}),
+        sorted({folder.parent for folder in sequences}) + sorted(others),
         labels,
         version=version,
         visibility=None,
@@ -287,7 +297,8 @@ def _files(
     version = detector.saved.config.data.label_version
     known: dict[pathlib.Path, tuple[pathlib.Path, Camera]] = {}
     if detector.takes_camera:
-        known = front_images(frames, detector, labels, version, camera_calibration)
+        own = camera_calibration
+        known = front_images(frames, detector, labels, version, own, paths)
     if not known:
         return keys, lambda batch: frames[batch]
     images = [known.get(path.absolute(), (None, None)) for path in frames]
@@ -365,7 +376,9 @@ def key_of(path: pathlib.Path) -> str:
 
     Only label files contain the LiDAR index.
     """
-    radar = path.stem.removeprefix("DERA_").removeprefix("tesseract_")
+    radar = path.stem
+    for pattern in ("DERA_*", *PATTERNS):
+        radar = radar.removeprefix(pattern.partition("*")[0])
     sequence = _sequence(path).name
     return frame_key(f"{sequence}/{radar}" if sequence else radar)
 

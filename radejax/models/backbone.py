@@ -113,7 +113,7 @@ class InputStem(nn.Module):
 
     A 1x1 convolution encodes Doppler to `features` channels and another encodes elevation
     to `features / 2` channels. A 3x3 convolution mixes both. All convolutions have
-    normalization and SiLU and no bias.
+    normalization and SiLU and no bias. An absent half is not encoded.
 
     Attributes:
         features: Output channels.
@@ -132,11 +132,14 @@ class InputStem(nn.Module):
         block = functools.partial(
             ConvGNSiLU, num_groups=self.num_groups, use_bias=False, dtype=self.dtype
         )
-        doppler, elevation = jnp.split(x, [self.doppler_bins], -1)
-        doppler = block(self.features, size=1, name="doppler")(doppler)
-        elevation = block(self.features // 2, size=1, name="elevation")(elevation)
-        mixed = jnp.concatenate([doppler, elevation], -1)
-        return block(self.features, name="mix")(mixed)
+        halves = jnp.split(x, [self.doppler_bins], -1)
+        widths = {"doppler": self.features, "elevation": self.features // 2}
+        encoded = [
+            block(width, size=1, name=name)(half)
+            for (name, width), half in zip(widths.items(), halves, strict=True)
+            if half.shape[-1]
+        ]
+        return block(self.features, name="mix")(jnp.concatenate(encoded, -1))
 
 
 class Backbone(nn.Module):

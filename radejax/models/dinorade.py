@@ -80,6 +80,9 @@ class DinoRade(RadeNet, kw_only=True):
             f"a width above {2 * MARGIN_PX} for config.model.fusion.out_of_view = "
             f"'official', which leaves out {MARGIN_PX} pixels left and right",
         )
+        kind, name = self.fusion.weighting, "config.model.fusion.weighting"
+        is_possible = self.elevation_bins > 0 or kind == "off"
+        require(is_possible, name, kind, "'off' without elevation channels")
         require(
             self.decoder_width % self.fusion.num_heads == 0,
             "config.model.fusion.num_heads",

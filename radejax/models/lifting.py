@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float
 
 from radejax.core.errors import require
 from radejax.geometry.camera import Camera, project
-from radejax.geometry.radar_grid import RadarGrid
+from radejax.geometry.radar_grid import RadarGrid, is_uniform, values_at
 from radejax.models.layers import Conv, Dense, GroupNorm
 
 OutOfViewRule = Literal["drop", "official"]
@@ -60,41 +60,50 @@ class ReferencePoints(struct.PyTreeNode):
 
 @dataclasses.dataclass(frozen=True)
 class LiftingAxes:
-    """Uniform axes of the query centers in range, azimuth and elevation.
+    """Axes of the query centers in range, azimuth and elevation.
 
     Instances are hashable, so that they can be attributes of a module.
 
     Attributes:
-        range_m: First bin center and step in meters.
-        azimuth_deg: First bin center and step in degrees, positive to the right.
+        range_m: First bin center and step in meters; for an axis that is not uniform, the
+            centers of all bins, of which there are at least three.
+        azimuth_deg: The same in degrees, positive to the right.
         elevation_deg: Start and end in degrees, positive up, of the interval that is
             divided into `num_elevation` segments. Use (18, -18) for a tensor whose
             elevation axis points down; code bases disagree about K-Radar's.
         num_elevation: Number E of elevation segments.
     """
 
-    range_m: tuple[float, float]
-    azimuth_deg: tuple[float, float]
+    range_m: tuple[float, ...]
+    azimuth_deg: tuple[float, ...]
     elevation_deg: tuple[float, float]
     num_elevation: int
 
     def __post_init__(self) -> None:
         for name in ("range_m", "azimuth_deg", "elevation_deg"):
             axis = getattr(self, name)
-            is_axis = len(axis) == 2 and bool(np.isfinite(axis).all())
-            require(is_axis, f"config.model.query_grid.{name}", axis, "two numbers")
+            is_axis = len(axis) == 2 or (len(axis) > 2 and name != "elevation_deg")
+            is_axis = is_axis and bool(np.isfinite(axis).all())
+            expected = "two numbers, or for range and azimuth the centers of all bins"
+            require(is_axis, f"config.model.query_grid.{name}", axis, expected)
 
     @classmethod
     def of_grid(cls, grid: RadarGrid, num_elevation: int = 10) -> LiftingAxes:
-        """Returns axes through the bin centers of the grid, which continue into padding."""
-        degrees = np.rad2deg
+        """Returns axes through the bin centers of the grid, which continue into padding.
+
+        A grid with fewer than two elevations gets those of K-Radar, -18 to 18 degrees.
+        """
+        range_m, azimuth, elevation = grid.range_m, grid.azimuth_rad, grid.elevation_rad
+        if is_uniform(range_m):
+            range_m = np.array([range_m[0], grid.range_step_m])
+        if is_uniform(azimuth):
+            azimuth = np.array([azimuth[0], grid.azimuth_step_rad])
+        if elevation.size < 2:
+            elevation = RadarGrid.kradar().elevation_rad
         return cls(
-            range_m=(float(grid.range_m[0]), grid.range_step_m),
-            azimuth_deg=(
-                float(degrees(grid.azimuth_rad[0])),
-                float(degrees(grid.azimuth_step_rad)),
-            ),
-            elevation_deg=tuple(degrees(grid.elevation_rad[[0, -1]]).tolist()),
+            range_m=tuple(range_m.tolist()),
+            azimuth_deg=tuple(np.rad2deg(azimuth).tolist()),
+            elevation_deg=tuple(np.rad2deg(elevation[[0, -1]]).tolist()),
             num_elevation=num_elevation,
         )
 
@@ -117,10 +126,8 @@ class LiftingAxes:
         `xp` a compiled program does not contain all centers as a constant. The result is
         float64 for NumPy and float32 for JAX.
         """
-        range_m = self.range_m[0] + self.range_m[1] * np.arange(num_range)
-        azimuth = np.deg2rad(
-            self.azimuth_deg[0] + self.azimuth_deg[1] * np.arange(num_azimuth)
-        )
+        range_m = _centers(self.range_m, num_range)
+        azimuth = np.deg2rad(_centers(self.azimuth_deg, num_azimuth))
         low, high = self.elevation_deg
         part = (np.arange(self.num_elevation) + 0.5) / self.num_elevation
         elevation = np.deg2rad(low + (high - low) * part)
@@ -130,6 +137,12 @@ class LiftingAxes:
         dtype = np.float64 if xp is np else np.float32
         unit = xp.asarray(np.stack(axes, -1)[None], dtype)
         return xp.asarray(range_m.reshape(-1, 1, 1, 1), dtype) * unit
+
+
+def _centers(axis: tuple[float, ...], count: int) -> Float[np.ndarray, " {count}"]:
+    if len(axis) == 2:
+        return axis[0] + axis[1] * np.arange(count)
+    return values_at(np.array(axis), np.arange(count))
 
 
 def reference_points(

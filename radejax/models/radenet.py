@@ -20,6 +20,7 @@ from radejax.core.errors import (
     SIZE,
     UserError,
     check_options,
+    integer,
     one_of,
     require,
 )
@@ -46,8 +47,8 @@ class RadeNet(nn.Module):
 
     Attributes:
         num_classes: Channels of the heatmap.
-        doppler_bins: Number of Doppler channels, the first of the projection.
-        elevation_bins: Number of elevation channels, which follow the Doppler channels.
+        doppler_bins: Number of Doppler channels, the first of the projection; 0 for none.
+        elevation_bins: Number of elevation channels, which follow them; 0 for none.
         widths: Channels of the encoder levels, finest first.
         decoder_width: Channels of the last decoder stage and of the neck.
         num_groups: Groups of every normalization; must divide every width.
@@ -91,10 +92,12 @@ class RadeNet(nn.Module):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        sizes = ["num_classes", "doppler_bins", "elevation_bins", "decoder_width"]
-        sizes += ["num_groups", "pad_multiple", "num_frames"]
+        sizes = ["num_classes", "decoder_width", "num_groups", "pad_multiple"]
+        sizes += ["num_frames"]
+        channels = ["doppler_bins", "elevation_bins"]
         ranges = {
             **dict.fromkeys(sizes, SIZE),
+            **dict.fromkeys(channels, integer(0, 1 << 16)),
             "widths": (
                 lambda widths: len(widths) > 0 and all(map(SIZE[0], widths)),
                 "one or several integers of at least 1",
@@ -110,6 +113,9 @@ class RadeNet(nn.Module):
         find_part(self.backbone, "config.model.backbone", BACKBONES, Backbone)
         find_part(self.neck, "config.model.neck", NECKS, Neck)
         find_part(self.heads, "config.model.heads", HEADS, Head)
+        least = "above 0 if config.model.doppler_bins is 0"
+        is_some = self.doppler_bins + self.elevation_bins > 0
+        require(is_some, "config.model.elevation_bins", self.elevation_bins, least)
         stride = 2 ** len(self.widths)
         require(
             self.pad_multiple % stride == 0,

@@ -88,8 +88,8 @@ _LOGGING = {
     ),
 }
 _SIZE = integer(1)
-_GRID = dict.fromkeys(("num_doppler", "num_range", "num_elevation"), _SIZE)
-_GRID |= {"num_azimuth": _SIZE, "max_range_m": POSITIVE}
+_GRID = dict.fromkeys(("num_doppler", "num_elevation"), integer(0))
+_GRID |= {"num_range": integer(2), "num_azimuth": integer(2), "max_range_m": POSITIVE}
 _KINDS: dict[type, Any] = {float: int | float, tuple: tuple | list}
 _OPTIONAL = ("data.visibility", "evaluation.roi", "train.checkpoints_to_keep")
 # Sections that not every config has. Their constructors check the names of the fields.
@@ -165,9 +165,13 @@ def check_bins(model: ConfigDict, grid: RadarGrid, source: str) -> None:
 def _check_simulation(config: ConfigDict) -> None:
     if "simulation" not in config:
         return
-    if isinstance(config.simulation.grid, ConfigDict):
+    if (
+        "num_range" in config.simulation.grid
+    ):  # not "kradar" and no fields of a RadarGrid
         check_options(config.simulation.grid, "config.simulation.grid", _GRID)
     grid = SimulationConfig.from_mapping(config.simulation).make_grid()
+    if not config.model.doppler_bins and grid.num_elevation:
+        grid = grid.without_doppler()  # as frames of a reduced release can be read
     check_bins(config.model, grid, "config.simulation.grid")
 
 

@@ -19,7 +19,7 @@ from radejax.core.errors import (
     require,
     several,
 )
-from radejax.geometry.radar_grid import RadarGrid
+from radejax.geometry.radar_grid import RadarGrid, is_uniform
 from radejax.simulation.radar.tensor import RadarParameters
 
 SIMULATOR_VERSION = 4
@@ -89,7 +89,8 @@ class SimulationConfig:
         frame_stride: Stride at which the frames of real labels are used.
         vru_density_scale: Factor on the number of pedestrians, motorcycles and bicycles
             in procedural training scenes, at most 5. Test scenes are not affected.
-        grid: Arguments of `RadarGrid.reduced`, or "kradar".
+        grid: Arguments of `RadarGrid.reduced`; or the fields of a `RadarGrid`, whose axes
+            are tuples of bin centers, empty without elevation or Doppler; or "kradar".
         radar: Fields of `RadarParameters` that differ from its defaults.
         output: "tesseract" to write 4D tensors in K-Radar's file format, "projection" to
             write only projections.
@@ -182,9 +183,13 @@ class SimulationConfig:
         is_mapping = isinstance(fields, Mapping)
         self._require(is_mapping, "grid", "'kradar' or arguments of RadarGrid.reduced")
         try:
-            return RadarGrid.reduced(**fields)
+            make = RadarGrid if "range_m" in fields else RadarGrid.reduced
+            grid = make(**fields)
         except (TypeError, ValueError) as error:
             raise UserError(f"config.simulation.grid: {error}") from None
+        doppler, name = grid.doppler_mps, "config.simulation.grid.doppler_mps"
+        require(is_uniform(doppler), name, doppler.tolist(), "uniform bins of an FFT")
+        return grid
 
     def make_parameters(self) -> RadarParameters:
         """Returns the parameters of the radar other than its axes."""

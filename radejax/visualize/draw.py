@@ -27,7 +27,7 @@ from matplotlib.lines import Line2D
 from radejax.core.errors import UserError
 from radejax.core.structures import ROIS
 from radejax.geometry.boxes import bev_corners, corners
-from radejax.geometry.radar_grid import RadarGrid
+from radejax.geometry.radar_grid import RadarGrid, values_at
 from radejax.visualize.camera import draw_camera
 from radejax.visualize.style import (
     COLOR_MAP,
@@ -99,7 +99,7 @@ def draw_map(
     first, last = max(rows[0] - 2, 0), min(rows[-1] + 3, grid.num_range)
     # Edges are half a bin outside the centers; negative ranges are clipped to zero.
     range_bin = np.arange(first, last + 1) - 0.5
-    range_bin = np.maximum(range_bin, -grid.range_m[0] / grid.range_step_m)
+    range_bin = np.maximum(range_bin, grid.ego_to_bin(0.0, 0.0)[0])
     azimuth_bin = np.arange(grid.num_azimuth + 1) - 0.5
     edges = grid.bin_to_ego(range_bin[:, None], azimuth_bin[None])  # [R'+1, A+1, 2]
     ax.set_facecolor(_OUTSIDE_COLOR)
@@ -156,9 +156,10 @@ def _draw_ground(scene: Scene, **options: Any) -> Axes:
 
 
 def bin_edges(centers: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n+1"]:
-    """Return the bin edges of a uniform axis with `n` bin centers."""
-    step = (centers[-1] - centers[0]) / (centers.size - 1)
-    return centers[0] + step * (np.arange(centers.size + 1) - 0.5)
+    """Return the edges of bins; a single bin is drawn with a width of 1."""
+    if centers.size == 1:
+        return centers[0] + np.array([-0.5, 0.5])
+    return values_at(centers, np.arange(centers.size + 1) - 0.5)
 
 
 def to_polar(points: Float[np.ndarray, "*points 2"]) -> Float[np.ndarray, "*points 2"]:
@@ -175,7 +176,7 @@ def _draw_polar(ax: Axes, scene: Scene, *, show_labels: bool) -> None:
     horizontal = bin_edges(np.rad2deg(scene.grid.azimuth_rad))
     vertical = bin_edges(scene.grid.range_m)
     draw_tiles(ax, horizontal, vertical, scene.power)
-    ax.set_xlim(horizontal[0], horizontal[-1])
+    ax.set_xlim(horizontal.min(), horizontal.max())
     ax.set_ylim(max(vertical[0], 0.0), vertical[-1])
     ax.set(xlabel="azimuth, right positive [deg]", ylabel="range [m]")
     _draw_over(ax, scene, to_polar, show_labels=show_labels)
@@ -284,7 +285,7 @@ def _draw_view(ax: Axes, scene: Scene, *, show_labels: bool = True) -> None:
 
 def _extent_m(grid: RadarGrid, roi: Sequence[float] | None) -> Extent:
     """Return the extent of the region and its surroundings, or of the field of view."""
-    far = grid.range_m[-1] + grid.range_step_m / 2
+    far = bin_edges(grid.range_m)[-1]
     side = far * np.sin(min(grid.fov_azimuth_rad, np.pi / 2))
     if roi is None:
         return -_BEHIND_M, far, -side, side
@@ -383,6 +384,8 @@ def _legend_handles(scene: Scene, *, show_counts: bool = True) -> list[Line2D]:
 def draw_slices(scene: Scene, *, range_idx: int | None = None) -> Figure:
     """Draw range-azimuth, range-Doppler and azimuth-elevation maps on one color scale.
 
+    There is no map of an axis that the radar does not measure.
+
     Ground truth is outlined in the range-azimuth and azimuth-elevation maps. Labels
     contain no Doppler, so the range-Doppler map shows the range interval of each box as a
     bar at the left edge.
@@ -409,28 +412,31 @@ def draw_slices(scene: Scene, *, range_idx: int | None = None) -> Figure:
         f"Azimuth–elevation, {at_range}": (azimuth, height),
     }
     planes = values.max(-1), doppler.max(1), elevation.max(0).T
+    truth = scene.ground_truth
+    outlines = _outlines(np.zeros((0, 7)) if truth is None else truth.box)
+    panels = list(zip(axes_of, planes, outlines, strict=True))
+    panels = [panel for panel in panels if panel[1].size]
     figure = new_figure(14.0, 4.2, layout="constrained")
-    axes = figure.subplots(1, 3)
+    axes = figure.subplots(1, len(panels))
     limits = color_limits_of(values)
-    for ax, plane, title in zip(axes, planes, axes_of, strict=True):
+    for ax, (title, plane, lines) in zip(axes, panels, strict=True):
         (x, x_label), (y, y_label) = axes_of[title]
         mesh = draw_tiles(ax, bin_edges(x), bin_edges(y), plane, limits)
         ax.set(xlabel=x_label, ylabel=y_label, title=title)
         figure.colorbar(mesh, ax=ax, label="normalized log power")
+        if x is grid.doppler_mps:
+            left, right = ax.get_xlim()
+            lines = [np.add(bar, [left + 0.02 * (right - left), 0.0]) for bar in lines]
+        # Lines are thinner here, as most boxes only cover a few bins.
+        draw_lines(ax, lines, GROUND_TRUTH.color, 0.7 * GROUND_TRUTH.width)
     figure.suptitle(scene.title)
-    if scene.ground_truth is not None:
-        left, right = axes[1].get_xlim()
-        outlines = _outlines(scene.ground_truth.box, left + 0.02 * (right - left))
-        for ax, lines in zip(axes, outlines, strict=True):
-            # Lines are thinner here, as most boxes only cover a few bins.
-            draw_lines(ax, lines, GROUND_TRUTH.color, 0.7 * GROUND_TRUTH.width)
     return figure
 
 
 def _outlines(
-    boxes: Float[np.ndarray, "N 7"], left: float
+    boxes: Float[np.ndarray, "N 7"],
 ) -> tuple[list[Float[np.ndarray, "_ 2"]], ...]:
-    """Return the lines of boxes in the three slices, with bars at a Doppler of `left`."""
+    """Return the lines of boxes in the three slices, with bars at a Doppler of 0."""
     azimuth_range = [to_polar(outline) for outline in footprints(boxes, 8)]
     bars, azimuth_elevation = [], []
     for outline, points in zip(azimuth_range, corners(boxes), strict=True):
@@ -442,5 +448,5 @@ def _outlines(
             np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]])
         )
         ranges = outline[:, 1]
-        bars.append(np.array([[left, ranges.min()], [left, ranges.max()]]))
+        bars.append(np.array([[0.0, ranges.min()], [0.0, ranges.max()]]))
     return azimuth_range, bars, azimuth_elevation

@@ -17,6 +17,8 @@ from radejax.data.projection import encode
 from radejax.geometry.camera import CameraCalibration, project
 from radejax.geometry.radar_grid import RadarGrid
 
+from .. import small_models as small
+
 GRID = RadarGrid.reduced(num_doppler=6, num_range=16, num_elevation=5, num_azimuth=12)
 CAMERA = CameraCalibration.from_angles(
     intrinsics=(560.0, 570.0, 600.0, 370.0),
@@ -155,3 +157,14 @@ def test_wrong_settings():
     with pytest.raises(UserError, match="cannot mirror: azimuths"):
         Augmentation(skewed, mirror_probability=0.5)
     Augmentation(skewed)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_uneven_azimuths_are_mirrored_if_they_are_symmetric(sign):
+    grid = small.uneven_grid()
+    azimuth = sign * grid.azimuth_rad
+    even = dataclasses.replace(grid, azimuth_rad=azimuth)
+    assert Augmentation(even, 0.5).mirror_probability == 0.5
+    tilted = dataclasses.replace(grid, azimuth_rad=azimuth + 0.01)
+    with pytest.raises(UserError, match="are not symmetric"):
+        Augmentation(tilted, 0.5)

@@ -8,6 +8,8 @@ from radejax.data.points import cfar_points, local_mean_db, read_lidar
 from radejax.data.projection import project_tensor
 from radejax.geometry.radar_grid import RadarGrid
 
+from .. import small_models as small
+
 GRID = RadarGrid.reduced(
     num_doppler=8, num_range=64, num_elevation=5, num_azimuth=56, max_range_m=75.6
 )
@@ -39,6 +41,26 @@ def test_points_are_where_the_echoes_are():
 def test_a_constant_map_has_no_points():
     points = cfar_points(np.full(GRID.projection_shape, 0.5, np.float32), GRID)
     assert [column.shape for column in points] == [(0,)] * 5
+
+
+@pytest.mark.parametrize("absent", ["elevation_rad", "doppler_mps"])
+def test_what_is_not_measured_is_zero_or_nan(absent):
+    axes = {"elevation_rad": np.array([0.1, 0.2]), absent: np.array([])}
+    grid = small.uneven_grid(range_m=np.geomspace(2.0, 60.0, 40), **axes)
+    power = np.full(grid.shape_drea, 1e9, np.float32)
+    power[-1, 30, -1, 5] = 1e13
+    projection = grid.measured_channels(project_tensor(power))
+    points = cfar_points(projection, grid, guard_cells=1, training_cells=2)
+    assert points.power_db == pytest.approx([130.0], abs=1e-3)
+    if absent == "doppler_mps":
+        assert points.z_m == pytest.approx(grid.range_m[30] * np.sin(0.2))
+        assert np.isnan(points.doppler_mps).all()
+    else:
+        assert points.z_m.tolist() == [0.0]
+        assert points.doppler_mps.tolist() == [grid.doppler_mps[-1]]
+    ground = np.array([points.x_m[0], points.y_m[0]])
+    ground *= grid.range_m[30] / np.linalg.norm(ground)
+    np.testing.assert_allclose(ground, grid.bin_to_ego(30, 5))
 
 
 PCD = """# .PCD v0.7 - Point Cloud Data file format

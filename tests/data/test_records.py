@@ -26,6 +26,8 @@ from radejax.data.records import Records, open_embeddings, open_projections, pre
 from radejax.data.tesseract import project_file, read_tesseract
 from radejax.geometry.radar_grid import RadarGrid
 
+from .. import small_models as small
+
 
 @pytest.fixture(scope="module")
 def data(kradar_root):
@@ -340,3 +342,18 @@ def test_a_full_disk_keeps_nothing_half_written(data, tmp_path, monkeypatch):
     ]
     assert Records.open(tmp_path).keys() == set()
     assert files.read_json(tmp_path / "records.json")["dtype"] == "float16"
+
+
+def test_uneven_axes_are_kept_and_told_apart(tmp_path):
+    uneven = small.uneven_grid()
+    source = {"grid": uneven.to_dict()}
+    Records.create(tmp_path, uneven.projection_shape, "float16", source)
+    assert open_projections(tmp_path, uneven).grid == uneven
+    first, last = uneven.azimuth_rad[[0, -1]]
+    even = small.uneven_grid(
+        azimuth_rad=np.linspace(first, last, 14), range_m=np.linspace(2.0, 30.0, 16)
+    )
+    with pytest.raises(
+        UserError, match=r"of 4 x 16 x 0 x 14 bins.*, not uniform, expected .* deg$"
+    ):
+        open_projections(tmp_path, even)

@@ -141,8 +141,24 @@ def test_reduced_grid_looks_like_the_sensor():
     ("changes", "message"),
     [
         ({"range_m": np.array([1.0])}, "range_m must be a vector of at least 2 bins"),
-        ({"azimuth_rad": np.array([0.0, 1.0, 3.0])}, "azimuth_rad must be uniform"),
-        ({"range_m": np.array([2.0, 1.0])}, "range_m must be uniform and increasing"),
+        (
+            {"azimuth_rad": np.array([0.0, 1.0, 0.5])},
+            "azimuth_rad must be increasing or",
+        ),
+        (
+            {"azimuth_rad": np.array([0.0, 0.0, 0.0])},
+            "azimuth_rad must be increasing or",
+        ),
+        (
+            {"azimuth_rad": np.array([])},
+            r"azimuth_rad must be .* 2 bins, got shape \(0,",
+        ),
+        ({"range_m": np.array([2.0, 1.0])}, "range_m must be increasing, got"),
+        ({"doppler_mps": np.zeros((2, 2))}, "doppler_mps must be a vector"),
+        (
+            {"doppler_mps": np.array([]), "elevation_rad": np.array([])},
+            "elevation_rad and doppler_mps are both empty",
+        ),
         ({"doppler_mps": np.array([0.0, np.nan])}, "doppler_mps must be finite"),
         ({"azimuth_rad": np.array([0.0, np.inf])}, "azimuth_rad must be finite"),
         ({"elevation_rad": np.array([0, 1e300])}, "elevation_rad must be finite"),
@@ -152,6 +168,93 @@ def test_reduced_grid_looks_like_the_sensor():
 def test_bad_axes_are_rejected(changes, message):
     with pytest.raises(ValueError, match=message):
         dataclasses.replace(KRADAR, **changes)
+
+
+# Axes that are not uniform -------------------------------------------------------------
+
+SINE = np.arcsin(np.linspace(-0.9, 0.9, 41))  # uniform in sin(azimuth)
+UNEVEN = RadarGrid(
+    range_m=np.geomspace(2.0, 80.0, 30),
+    azimuth_rad=SINE,
+    elevation_rad=np.array([]),
+    doppler_mps=np.linspace(-5.0, 5.0, 8),
+    fov_range_m=80.0,
+    fov_azimuth_rad=1.1,
+)
+TO_THE_LEFT = dataclasses.replace(UNEVEN, azimuth_rad=SINE[::-1])
+EVEN_LEFT = dataclasses.replace(KRADAR, azimuth_rad=KRADAR.azimuth_rad[::-1])
+
+
+@pytest.mark.parametrize("grid", [UNEVEN, TO_THE_LEFT, EVEN_LEFT])
+def test_nearest_bin_of_any_axis_is_that_with_the_nearest_center(grid):
+    rng = np.random.default_rng(0)
+    range_m = rng.uniform(grid.range_m[0], grid.range_m[-1], 500)
+    azimuth = rng.uniform(-1.2, 1.2, 500)  # also beyond the axis
+    x, y = range_m * np.cos(azimuth), -range_m * np.sin(azimuth)
+    pairs = (range_m, grid.range_m), (azimuth, grid.azimuth_rad)
+    nearest = [abs(value[:, None] - axis).argmin(1) for value, axis in pairs]
+    np.testing.assert_array_equal(grid.nearest_bin(x, y), np.stack(nearest, -1))
+    jitted = jax.jit(grid.nearest_bin)(x.astype(np.float32), y.astype(np.float32))
+    assert (np.asarray(jitted) == np.stack(nearest, -1)).mean() > 0.999
+
+
+@settings(deadline=None, max_examples=50)
+@given(st.floats(-0.5, 32), st.floats(-2, 43), st.sampled_from([UNEVEN, TO_THE_LEFT]))
+def test_bins_and_meters_are_inverse_on_any_axis(range_bin, azimuth_bin, grid):
+    position = grid.bin_to_ego(range_bin, azimuth_bin)
+    found = grid.ego_to_bin(position[0], position[1])
+    np.testing.assert_allclose(found, [range_bin, azimuth_bin], atol=1e-9)
+    on_device = jax.jit(grid.bin_to_ego)(range_bin, azimuth_bin)
+    np.testing.assert_allclose(on_device, position, atol=1e-4)
+
+
+def test_positions_between_bins_by_hand():
+    grid = dataclasses.replace(UNEVEN, range_m=np.array([1.0, 2.0, 4.0, 8.0]))
+    ranges = grid.bin_to_ego(np.array([-1.0, 0.5, 1.5, 3.0, 4.0]), np.full(5, 20.0))
+    np.testing.assert_allclose(ranges[:, 0], [0.0, 1.5, 3.0, 8.0, 12.0])
+    np.testing.assert_allclose(ranges[:, 1], 0.0, atol=1e-12)
+    np.testing.assert_allclose(grid.range_widths_m, [1.0, 1.5, 3.0, 4.0])
+
+
+def test_boxes_are_decoded_at_the_centers_of_uneven_bins():
+    bins = np.indices((30, 41)).reshape(2, -1).T
+    boxes = UNEVEN.boxes_at(jnp.zeros((len(bins), 8)), jnp.array(bins))
+    np.testing.assert_allclose(
+        boxes[:, :2], UNEVEN.bin_centers_ego().reshape(-1, 2), atol=1e-4
+    )
+    assert UNEVEN.nearest_bin(boxes[:, 0], boxes[:, 1]).tolist() == bins.tolist()
+
+
+def test_padding_continues_uneven_axes_and_cannot_stretch_them():
+    padded = UNEVEN.padded(8)
+    assert (padded.num_range, padded.num_azimuth) == (32, 48)
+    np.testing.assert_allclose(padded.range_m[:30], UNEVEN.range_m, rtol=1e-12)
+    np.testing.assert_allclose(padded.azimuth_rad[:41], SINE, atol=1e-12)
+    np.testing.assert_allclose(np.diff(padded.azimuth_rad[40:]), SINE[-1] - SINE[-2])
+    with pytest.raises(ValueError, match="is 'stretched', expected true for uneven"):
+        UNEVEN.padded(8, "stretched")
+
+
+def test_an_absent_axis_has_one_bin_in_tesseracts_and_no_channel():
+    assert UNEVEN.shape_drea == (8, 30, 1, 41)
+    assert UNEVEN.projection_shape == (30, 41, 8)
+    flat = dataclasses.replace(
+        UNEVEN, elevation_rad=np.array([0.1, 0.2]), doppler_mps=np.array([])
+    )
+    assert flat.shape_drea == (1, 30, 2, 41)
+    projection = np.arange(3.0)
+    assert flat.measured_channels(projection).tolist() == [1.0, 2.0]
+    assert UNEVEN.measured_channels(np.arange(9.0)).tolist() == list(range(8))
+    assert KRADAR.measured_channels(projection := np.arange(101.0)) is projection
+    again = RadarGrid.from_dict(json.loads(json.dumps(flat.to_dict())))
+    assert again == flat
+    assert again != UNEVEN
+
+
+def test_a_single_bin_of_a_reduced_grid_is_at_zero():
+    grid = RadarGrid.reduced(num_doppler=1, num_range=8, num_elevation=1, num_azimuth=8)
+    assert (grid.doppler_mps.tolist(), grid.elevation_rad.tolist()) == ([0], [0])
+    assert grid.shape_drea == (1, 8, 1, 8)
 
 
 @pytest.mark.wrong_types

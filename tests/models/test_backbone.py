@@ -13,6 +13,8 @@ from radejax.models.backbone import (
     SpatialAttention,
 )
 
+from .. import small_models as small
+
 
 def test_input_stem_equals_official(module_case, run_like_torch):
     x, expected = module_case("input_stem")
@@ -112,3 +114,12 @@ def test_paper_block_is_equations_6_to_9():
     assert set(p) == {"channel", "spatial"}  # no convolutions of the map
     found = module.apply(variables, jnp.asarray(x))
     np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize(("doppler_bins", "there"), [(0, "elevation"), (3, "doppler")])
+def test_the_stem_encodes_no_half_without_channels(doppler_bins, there):
+    stem = InputStem(8, doppler_bins, 4)
+    x = jnp.ones((1, 4, 4, 3))
+    variables = small.drawn(stem, x)
+    assert set(variables["params"]) == {there, "mix"}
+    assert stem.apply(variables, x).shape == (1, 4, 4, 8)

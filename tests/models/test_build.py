@@ -54,3 +54,24 @@ def test_a_module_made_by_hand_is_checked() -> None:
     model = models.build(small.radar_config().model)
     with pytest.raises(UserError, match=r"model.neck is 'wide', expected .*'plain'"):
         model.clone(neck="wide")
+
+
+def test_an_axis_may_have_no_channels_but_not_both() -> None:
+    config = small.radar_config().model
+    config.elevation_bins = 0
+    assert models.build(config).elevation_bins == 0
+    config.doppler_bins = 0
+    with pytest.raises(UserError, match=r"elevation_bins is 0, expected above 0 if"):
+        models.build(config)
+    config.update(doppler_bins=-1, elevation_bins=3)
+    with pytest.raises(UserError, match=r"doppler_bins is -1, expected an integer"):
+        models.build(config)
+
+
+def test_elevation_weights_need_elevation_channels() -> None:
+    config = small.camera_config().model
+    config.elevation_bins = 0
+    with pytest.raises(UserError, match=r"weighting is 'mlp', expected 'off' without"):
+        models.build(config)
+    config.fusion.weighting = "off"
+    assert models.build(config).elevation_bins == 0

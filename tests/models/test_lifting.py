@@ -1,5 +1,7 @@
 """Tests of radejax.models.lifting."""
 
+import dataclasses
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -188,3 +190,29 @@ def test_without_weights_queries_are_copies():
     network = WeightingNetwork(6, "off")
     weights = network.apply({}, jnp.zeros((1, 2, 3, 9)))
     np.testing.assert_array_equal(weights, np.ones((1, 2, 3, 6)))
+
+
+def test_uneven_axes_are_given_by_all_centers_and_continue_into_padding():
+    grid = small.uneven_grid()
+    axes = LiftingAxes.of_grid(grid, 1)
+    assert (len(axes.range_m), len(axes.azimuth_deg)) == (16, 14)
+    assert axes.elevation_deg == (-18.0, 18.0)
+    centers = axes.centers_ego(16, 16)[:, :, 0]
+    np.testing.assert_allclose(centers[:, :14, :2], grid.bin_centers_ego(), atol=1e-9)
+    padded = grid.padded(8)
+    np.testing.assert_allclose(centers[..., :2], padded.bin_centers_ego(), atol=1e-9)
+    assert hash(axes) == hash(LiftingAxes.of_grid(grid, 1))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"range_m": (1.0,)},
+        {"azimuth_deg": (0.0, 1.0, np.nan)},
+        {"elevation_deg": (-1.0, 0.0, 1.0)},
+    ],
+)
+def test_impossible_axes_are_named(changes):
+    (name,) = changes
+    with pytest.raises(ValueError, match=rf"query_grid.{name} is .* two numbers, or"):
+        dataclasses.replace(AXES, **changes)

@@ -1,6 +1,8 @@
 """Every field of every section is checked before a run does anything."""
 
+import dataclasses
 import itertools
+import json
 import math
 import pathlib
 import re
@@ -9,11 +11,15 @@ from typing import Any
 import pytest
 from ml_collections import ConfigDict
 
+from radejax import models
 from radejax.core.config import base_config, fields_of, load_config, load_module
 from radejax.core.errors import UserError
+from radejax.models.lifting import LiftingAxes
 from radejax.runs import experiment
 from radejax.runs.checks import check
 from radejax.training import distributed
+
+from .. import small_models as small
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
 NAN, INF = math.nan, math.inf
@@ -182,6 +188,24 @@ def test_what_one_field_asks_of_another() -> None:
         check(config)
     with pytest.raises(UserError, match="doppler_bins is 64, expected 16"):
         check(_with("model.doppler_bins", 64))
+
+
+def test_axes_are_given_as_tuples_of_bin_centers() -> None:
+    grid, config = small.uneven_grid(), load_config("quickstart_fusion").unlock()
+    config.simulation.grid = grid.to_dict()
+    axes = LiftingAxes.of_grid(grid)
+    config.model.query_grid.update(range_m=axes.range_m, azimuth_deg=axes.azimuth_deg)
+    with pytest.raises(UserError, match="doppler_bins is 16, expected 4, as"):
+        check(config)
+    config.model.update(doppler_bins=4, elevation_bins=0)
+    config.model.fusion.weighting = "off"
+    check(config)
+    saved = ConfigDict(json.loads(config.to_json()))
+    check(saved)
+    built = models.build(saved.model).query_grid
+    assert built == dataclasses.replace(
+        axes, elevation_deg=(-6.0, 6.0), num_elevation=4
+    )
 
 
 def _words(name: str) -> list[str]:

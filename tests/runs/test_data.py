@@ -6,6 +6,7 @@ import shutil
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from ml_collections import ConfigDict
 
@@ -13,6 +14,8 @@ from radejax import models
 from radejax.core.config import base_config
 from radejax.core.errors import UserError
 from radejax.data.kradar import KRadar
+from radejax.data.kradar.reduce import reduce_dataset
+from radejax.runs import checks
 from radejax.runs import data as run_data
 from radejax.runs.data import Data, data_name, data_of_run, located, open_data
 from radejax.simulation.dataset import default_config, simulate_dataset
@@ -121,6 +124,34 @@ def test_frames_are_projected_beside_their_data_once(
     _open(config)
     assert "preprocess" not in capsys.readouterr().err
     assert written() == before
+
+
+def test_reduced_releases_are_read_with_and_without_doppler(
+    root: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    """Also next to each other, as they have records of their own."""
+    simulation = default_config() | {"frames_per_sequence": 1, "image_width": 0}
+    simulation |= {"train_sequences": 2, "test_sequences": 1}
+    tensors = simulate_dataset(simulation, tmp_path / "tensors", progress=False)
+    reduced = tmp_path / "reduced"
+    reduce_dataset([tensors], reduced, "polar3d")
+    found = {}
+    for doppler_bins in (16, 0):
+        config = _config(reduced)
+        config.model.doppler_bins = doppler_bins
+        config.simulation = ConfigDict(simulation)
+        checks.check(config)
+        data = _open(config)
+        assert data.frames.grid.num_doppler == doppler_bins
+        found[doppler_bins] = data.records[data.split("test")[0].key]
+    assert found[16].shape == (64, 56, 16 + 9)
+    np.testing.assert_array_equal(found[0], found[16][..., 16:])
+    config.data.roots, config.simulation = (str(root),), None
+    del config.simulation
+    with pytest.raises(
+        UserError, match=r"doppler_bins is 0, expected 16, as the radar"
+    ):
+        _open(config)
 
 
 def test_results_on_other_data_are_named_by_folder_and_labels(

@@ -16,6 +16,8 @@ from radejax.simulation.radar.propagation import WEATHERS
 from radejax.simulation.radar.tensor import RadarParameters
 from radejax.simulation.world.environments import ENVIRONMENTS
 
+from .. import small_models as small
+
 
 def test_default_has_every_weather_in_training_and_several_held_out():
     config = SimulationConfig.from_mapping(default_config())
@@ -101,3 +103,27 @@ def test_every_field_of_the_radar_has_limits_that_its_default_keeps():
 def test_kradar_grid():
     config = SimulationConfig.from_mapping(default_config() | {"grid": "kradar"})
     assert config.make_grid().shape_drea == (64, 256, 37, 107)
+
+
+def test_a_grid_may_be_given_by_its_axes() -> None:
+    grid = small.uneven_grid()
+    config = default_config() | {"grid": grid.to_dict()}
+    as_config_dict = ml_collections.ConfigDict(config)
+    found = SimulationConfig.from_mapping(as_config_dict)
+    assert found.make_grid() == grid
+    again = SimulationConfig.from_mapping(json.loads(found.to_json()))
+    assert again.make_grid() == grid
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"doppler_mps": (-1.0, 0.0, 3.0)}, "doppler_mps is .* expected uniform bins"),
+        ({"range_m": (3.0, 1.0)}, "grid: range_m must be increasing"),
+        ({"azimut_rad": (3.0, 1.0)}, "grid: .*unexpected .*'azimut_rad'"),
+    ],
+)
+def test_wrong_axes_are_named(change: dict[str, object], message: str) -> None:
+    axes = small.uneven_grid().to_dict() | change
+    with pytest.raises(UserError, match=message):
+        SimulationConfig.from_mapping(default_config() | {"grid": axes})

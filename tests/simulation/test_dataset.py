@@ -12,15 +12,22 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from radejax import Detector, models
 from radejax.core.errors import UserError
 from radejax.data.cameras import CameraOptions
 from radejax.data.kradar import KRadar, read_labels
+from radejax.data.kradar.check import check_dataset
 from radejax.data.pipeline import camera_inputs
+from radejax.data.projection import project_tensor
+from radejax.data.tesseract import read_tesseract
+from radejax.inference.saved import SavedModel
 from radejax.simulation import dataset
 from radejax.simulation.camera.renderer import stereo_calibration
 from radejax.simulation.config import SimulationConfig
 from radejax.simulation.dataset import default_config, simulate_dataset
 from radejax.simulation.simulator import make_source
+
+from .. import small_models as small
 
 
 def small_config(**changes):
@@ -207,3 +214,29 @@ def test_expected_size_is_that_of_the_files(output, tmp_path):
     files = [p for p in root.rglob("*") if p.suffix in (".mat", ".npy", ".png")]
     assert num_frames == 2
     assert expected == pytest.approx(sum(p.stat().st_size for p in files), rel=0.2)
+
+
+def test_a_sensor_without_elevation_is_a_kradar_tree_without_its_channels(tmp_path):
+    grid = small.uneven_grid(fov_range_m=60.0, range_m=np.geomspace(2.0, 60.0, 32))
+    config = small_config(
+        grid=grid.to_dict(), frames_per_sequence=1, image_width=0, train_sequences=1
+    )
+    root = simulate_dataset(config, tmp_path / "data", progress=False)
+    assert check_dataset(root).num_problems == 0
+    frames = KRadar(root)
+    assert frames.grid == grid
+    power = read_tesseract(frames[0].radar_path)
+    assert power.shape == (4, 32, 1, 14)
+    projection = frames[0].read_projection(grid)
+    assert projection.shape == grid.projection_shape == (32, 14, 4)
+    np.testing.assert_array_equal(projection, project_tensor(power)[..., :4])
+    # As the input of a detector, the tensor gives what its projection gives.
+    config = small.radar_config()
+    config.model.update(doppler_bins=4, elevation_bins=0)
+    variables = small.drawn(models.build(config.model), projection[None])
+    detector = Detector(SavedModel(config, grid, variables), score_threshold=0.0)
+    by_power, by_projection = detector(power), detector(projection)
+    np.testing.assert_allclose(by_power.scores, by_projection.scores, atol=1e-3)
+    assert by_power.is_valid.any()
+    again = detector(str(frames[0].radar_path))
+    np.testing.assert_array_equal(again.boxes, by_projection.boxes)

@@ -8,6 +8,8 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.visualize import draw
 from radejax.visualize.style import Scene
 
+from .. import small_models as small
+
 GRID = RadarGrid.reduced(num_doppler=4, num_range=6, num_elevation=3, num_azimuth=5)
 # The digits of a value are its place: range, azimuth, channel.
 PROJECTION = (
@@ -63,3 +65,26 @@ def test_boxes_are_outlined_in_all_slices() -> None:
     np.testing.assert_allclose(lines[2].max(0), [side, top], rtol=1e-6)
     without = draw.draw_slices(SCENE).axes[0]
     assert not [c for c in without.findobj(LineCollection) if len(c.get_segments())]
+
+
+def test_there_is_no_slice_of_an_absent_axis() -> None:
+    grid = small.uneven_grid()
+    box = np.array([[10.0, 0.0, 0.0, 4.0, 2.0, 2.0, 0.0]])
+    truth = Boxes.one_frame(box, ["Sedan"])
+    values = np.random.default_rng(0).uniform(size=grid.projection_shape)
+    figure = draw.draw_slices(Scene(values, grid, ground_truth=truth))
+    titles = [ax.get_title() for ax in figure.axes if ax.get_title()]
+    assert [title.split(",")[0] for title in titles] == [
+        "Range–azimuth",
+        "Range–Doppler (aliased)",
+    ]
+    flat = small.uneven_grid(elevation_rad=np.array([0.1]), doppler_mps=np.array([]))
+    scene = Scene(values[..., :1], flat, ground_truth=truth)
+    power, elevation = planes(draw.draw_slices(scene))[:2]
+    assert (power.shape, elevation.shape) == ((16, 14), (1, 14))
+
+
+def test_edges_of_uneven_bins_are_between_their_centers():
+    edges = draw.bin_edges(np.array([1.0, 2.0, 4.0]))
+    np.testing.assert_allclose(edges, [0.5, 1.5, 3.0, 5.0])
+    np.testing.assert_allclose(draw.bin_edges(np.array([3.0])), [2.5, 3.5])

@@ -172,8 +172,8 @@ def _tensors(folder: SequenceFolder) -> list[pathlib.Path]:
 
 
 def _projections(folder: SequenceFolder) -> list[pathlib.Path]:
-    files = folder.listing("DERA_tesseract").values()
-    return [path for path in files if path.suffix == ".npy"]
+    files = folder.listing("DERA_tesseract") | folder.listing(".")
+    return [path for path in files.values() if path.suffix == ".npy"]
 
 
 def _row(

@@ -122,17 +122,20 @@ def noise_profile(
     law = WEATHERS[weather]
     beam = (2.4 / parameters.azimuth_elements) * (2.4 / parameters.elevation_elements)
     distance = np.maximum(grid.range_m, 1.0)
-    volume = distance**2 * beam * grid.range_step_m
+    volume = distance**2 * beam * grid.range_widths_m
     clutter = 10.0 ** ((parameters.gain_db + law.backscatter_db) / 10.0) * (
         volume / distance**4 * attenuation(weather, distance)
     )
-    step = grid.doppler_mps[1] - grid.doppler_mps[0]
-    period = step * grid.num_doppler
-    offset = grid.doppler_mps + ego_velocity_mps[0]
-    folds = np.arange(-6, 7) * period
-    offset = np.mod(offset + period / 2, period) - period / 2
-    density = np.exp(-0.5 * ((offset[:, None] + folds) / law.spread_mps) ** 2).sum(1)
-    share = density / density.sum()
+    share = np.ones(1)
+    if grid.num_doppler > 1:
+        step = grid.doppler_mps[1] - grid.doppler_mps[0]
+        period = step * grid.num_doppler
+        offset = grid.doppler_mps + ego_velocity_mps[0]
+        folds = np.arange(-6, 7) * period
+        offset = np.mod(offset + period / 2, period) - period / 2
+        spread = (offset[:, None] + folds) / law.spread_mps
+        density = np.exp(-0.5 * spread**2).sum(1)
+        share = density / density.sum()
     noise = 10.0 ** (parameters.noise_db / 10.0)
     return (noise + clutter[:, None] * share[None]).astype(np.float32)
 

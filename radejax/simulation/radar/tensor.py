@@ -61,7 +61,7 @@ class RadarParameters:
         elevation_elements: Number of elements of the virtual array in elevation, at the
             same spacing.
         array_pedestal: Taper of the array, from 0 (Hann window) to 1 (uniform window).
-        range_resolution_m: Width of a range bin of the FFT, or 0 for the grid's step.
+        range_resolution_m: Width of a range bin of the FFT, or 0 for the grid's bins.
         pattern_exponent: Exponent of the two-way antenna gain `cos(angle) ** exponent`.
         max_scatterers_per_row: Maximum number of scatterers summed in one range row.
             Only the strongest ones are summed.
@@ -142,7 +142,12 @@ def window_response(
 def doppler_response(
     velocity_mps: Float[Array, " S"], grid: RadarGrid
 ) -> Float[jax.Array, "D S"]:
-    """Computes amplitudes on the Doppler axis, where velocities alias by its period."""
+    """Computes amplitudes on the Doppler axis, where velocities alias by its period.
+
+    A single bin, as that of a radar without Doppler, receives all velocities alike.
+    """
+    if grid.num_doppler < 2:
+        return jnp.ones((1, velocity_mps.shape[0]))
     step = float(grid.doppler_mps[1] - grid.doppler_mps[0])
     cell = (velocity_mps[None] - grid.doppler_mps[0]) / step
     offset = np.arange(grid.num_doppler, dtype=np.float32)[:, None] - cell
@@ -153,9 +158,10 @@ def range_response(
     range_m: Float[Array, " S"], grid: RadarGrid, parameters: RadarParameters
 ) -> Float[jax.Array, "R S"]:
     """Computes amplitudes on the range axis."""
-    resolution = parameters.range_resolution_m or grid.range_step_m
+    resolution = parameters.range_resolution_m or grid.range_widths_m
     axis = grid.range_m.astype(np.float32)[:, None]
-    return window_response((axis - range_m[None]) / resolution, 0.0)
+    offset = (axis - range_m[None]) / np.reshape(resolution, (-1, 1))
+    return window_response(offset, 0.0)
 
 
 @functools.partial(jax.jit, static_argnames=("grid", "parameters", "output"))
@@ -176,7 +182,8 @@ def simulate(
             same statistics.
         key: Random key of the noise of this frame.
         grid: Axes of the tensor.
-        parameters: Parameters of the sensor.
+        parameters: Parameters of the sensor. One without elevation sees with a single beam
+            at elevation 0.
         output: "rows" for the tensor in linear power as `[R, E, D, A]`, the order in
             which it is computed (see `TESSERACT_OF_ROWS`), or "projection" for its
             normalized projections `[R, A, D+E]`, with the same values as those of
@@ -186,8 +193,9 @@ def simulate(
         float32 array, the tensor or its projections as selected by `output`.
     """
     pedestal = parameters.array_pedestal
+    elevation_rad = grid.elevation_rad if grid.num_elevation else np.zeros(1)
     arrays = (
-        (grid.elevation_rad, scatterers.elevation_rad, parameters.elevation_elements),
+        (elevation_rad, scatterers.elevation_rad, parameters.elevation_elements),
         (grid.azimuth_rad, scatterers.azimuth_rad, parameters.azimuth_elements),
     )
     bases = [array_basis(axis, n, pedestal) for axis, _, n in arrays]
@@ -210,7 +218,9 @@ def simulate(
         received = _product(left.reshape(-1, num_kept), right)
         received += _noise(noise, key, row_idx, received.size).reshape(received.shape)
         power = jnp.square(_beams(received, *bases)).sum(axis=2)  # [E, D, A]
-        return _project_row(power) if output == "projection" else power
+        if output != "projection":
+            return power
+        return grid.measured_channels(_project_row(power))
 
     rows = (kept, in_range, noise_power, jnp.arange(grid.num_range, dtype=jnp.uint32))
 

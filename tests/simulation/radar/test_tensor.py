@@ -6,9 +6,12 @@ import jax
 import numpy as np
 import pytest
 
+from radejax.data.projection import project_tensor
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.simulation.radar import tensor
+from radejax.simulation.radar import propagation, tensor
 from radejax.simulation.radar.scattering import received_power
+
+from ... import small_models as small
 
 GRID = RadarGrid.reduced(
     num_doppler=16, num_range=32, num_elevation=9, num_azimuth=24, max_range_m=31.0
@@ -409,3 +412,40 @@ class TestOutputs:
     def test_key_depends_on_every_number(self):
         keys = {tuple(tensor.frame_key(*k)) for k in ((1, 2, 3), (1, 2, 4), (1, 3, 3))}
         assert len(keys) == 3
+
+
+class TestOtherSensors:
+    def test_an_echo_is_in_the_bins_of_uneven_axes(self):
+        grid = small.uneven_grid(range_m=np.geomspace(4.0, 60.0, 40))
+        quiet = np.zeros((40, 4), np.float32)
+        given = points(grid.range_m[30], grid.azimuth_rad[3], 0.0, grid.doppler_mps[1])
+        power = tesseract(given, noise=quiet, grid=grid)
+        assert power.shape == grid.shape_drea == (4, 40, 1, 14)
+        strongest = np.unravel_index(power.argmax(), power.shape)
+        assert strongest == (1, 30, 0, 3)
+        np.testing.assert_allclose(power.max(), 1.0, rtol=1e-4)
+        # The main lobe is four bins wide, whatever their width.
+        lobe = power[1, :, 0, 3]
+        assert lobe[27] < 0.05 < lobe[29] < 0.5
+        projection = tensor.simulate(
+            given, quiet, tensor.frame_key(1), grid=grid, parameters=PARAMETERS
+        )
+        expected = project_tensor(power.astype(np.float32))[..., :4]
+        np.testing.assert_allclose(projection, expected, atol=2e-4)
+
+    @pytest.mark.parametrize("doppler_mps", [[], [0.0]])
+    def test_one_doppler_bin_has_all_velocities(self, doppler_mps):
+        grid = small.uneven_grid(
+            elevation_rad=np.array([-0.1, 0.0, 0.1]), doppler_mps=np.array(doppler_mps)
+        )
+        quiet = np.zeros((16, 1), np.float32)
+        given = points(grid.range_m[10], grid.azimuth_rad[3], 0.0, [3.0])
+        power = tesseract(given, noise=quiet, grid=grid)
+        np.testing.assert_allclose(power.max(), 1.0, rtol=1e-4)
+        projection = tensor.simulate(
+            given, quiet, tensor.frame_key(1), grid=grid, parameters=PARAMETERS
+        )
+        assert projection.shape == grid.projection_shape
+        noise = propagation.noise_profile("fog", grid, PARAMETERS, np.zeros(2))
+        assert noise.shape == (16, 1)
+        assert (noise > 10.0 ** (PARAMETERS.noise_db / 10)).all()
