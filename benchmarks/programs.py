@@ -1,8 +1,11 @@
 """Analyzes programs lowered for GPUs without running them, and computes lower bounds of their time.
 
     python benchmarks/programs.py    # full size, bfloat16; a minute, without accelerator
+    python benchmarks/programs.py --training dinorade dinorade:r
 
-Writes `docs/reports/benchmarks/programs.json` and its table in `docs/reports/benchmarks.md`.
+The first writes `docs/reports/benchmarks/programs.json` and its table in
+`docs/reports/benchmarks.md`. The second prints lower bounds of the time and memory of
+trainings on an A100, which `docs/reproduce.md` contains.
 
 Every program is lowered with `jax.export` for a platform that need not be available. `facts`
 extracts types, host callbacks, convolutions, transposes and loops from its text. `work` counts the
@@ -23,6 +26,7 @@ import re
 import shlex
 import sys
 
+import flax.linen as nn
 import jax
 import jax.export
 import jax.numpy as jnp
@@ -32,6 +36,7 @@ from radejax.core.config import load_config
 from radejax.core.structures import Batch
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.detector import detect, placeholder
+from radejax.models.layers import GroupNorm
 from radejax.simulation.radar import tensor
 from radejax.training.step import create_state, make_optimizer, make_train_step
 
@@ -221,6 +226,44 @@ def least_seconds(found, device):
     return total
 
 
+TRAINING_FRAMES = 17_458  # of K-Radar
+
+
+def least_training(config, grid=None, device="A100"):
+    """Returns lower bounds of the hours and gigabytes that a training needs.
+
+    The hours are those of all steps, without loading data, evaluation and checkpoints. The
+    memory is that of the training state, the gradient, one batch, and the inputs of all group
+    and batch normalizations, which the backward pass needs.
+    """
+    train = config.train
+    step, arguments = train_step(config, grid or RadarGrid.kradar(), train.batch_size)
+    steps = TRAINING_FRAMES // train.batch_size * train.num_epochs
+    hours = steps * least_seconds(work(step, arguments, "cuda"), device) / 3600
+    state, batch, rng = arguments
+    size = sum(map(_bytes, jax.tree.leaves((state, state.params, batch))))
+
+    def note(function, args, kwargs, context):
+        nonlocal size
+        is_norm = isinstance(context.module, (nn.BatchNorm, GroupNorm))
+        if is_norm and context.method_name == "__call__":
+            size += _bytes(args[0])
+        return function(*args, **kwargs)
+
+    with nn.intercept_methods(note):
+        model = models.build(config.model)
+        jax.eval_shape(
+            lambda *x: model.init(x[0], *x[1].model_inputs(), train=False), rng, batch
+        )
+    return hours, size / 1e9
+
+
+def bounds_text(config):
+    """Returns the lower bounds of a training, rounded down, such as "0.4 h, 3.9 GB"."""
+    hours, size = (math.floor(10 * x) / 10 for x in least_training(config))
+    return f"{hours} h, {size} GB"
+
+
 # Table ---------------------------------------------------------------------------------
 
 
@@ -269,11 +312,17 @@ def rows(size):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--batch", type=int, default=8)
+    parser.add_argument("--training", nargs="+", metavar="CONFIG")
+    args = parser.parse_args()
+    if args.training:
+        for name in args.training:
+            print(f"{name}: at least {bounds_text(load_config(name))}")
+        return
     result = {
         "command": shlex.join(["python", "benchmarks/programs.py", *sys.argv[1:]]),
         "date": datetime.date.today().isoformat(),
         "jax": jax.__version__,
-        "programs": list(rows(parser.parse_args().batch)),
+        "programs": list(rows(args.batch)),
     }
     print(page.programs_table(result))
     text = json.dumps(result, indent=1) + "\n"

@@ -8,7 +8,7 @@ The argument is a list of options, at most one of each group:
 
 - variant: `r` radar-only (a RADE-Net with the dual stem), `rc` with camera and without elevation
   weights, `rcw` (default) the whole model, `rcw_resnet50` with a ResNet-50, whose last stage is
-  trained, instead of DINOv3.
+  trained, instead of DINOv3; `rcw_dinov2` with DINOv2 ViT-S/14, which is not in the paper.
 - preset: `paper` or `official` (the released code with these values, including its geometry). The
   paper's models were not trained with `official`: the released settings for radar and camera
   (`params_radcam.py`) are a copy of the radar-only ones and lack keys that the code reads. The
@@ -17,7 +17,8 @@ The argument is a list of options, at most one of each group:
 - sigma: `sigma3`, `sigma0.75`, `adaptive`, `anisotropic`, as in `radenet.py`.
 - classes: `all` (default; five classes, v2.1 labels) or `sedan` (v1.1 labels).
 
-Table 4 reports (Sedan AP of the five-class models, narrow region, IoU 0.3):
+Table 4 reports (Sedan AP of the five-class models, without the option `sedan`, narrow region,
+IoU 0.3):
 
 | variant | AP 3D | AP BEV |
 |---|---|---|
@@ -53,8 +54,13 @@ VARIANTS = {
     "rc": {"model.fusion.weighting": "off"},
     "rcw": {},
     "rcw_resnet50": {"model.image.kind": "resnet50"},
+    "rcw_dinov2": {
+        "model.image.patch_size": 14,
+        "model.image.num_registers": 0,
+        "model.image.position_grid": 37,
+    },
 }
-"""Fields that each row of Table 4 changes in the full model."""
+"""Fields that each row of Table 4 and `rcw_dinov2` change in the full model."""
 
 PRESETS = {
     "paper": {
@@ -127,7 +133,8 @@ def _add_camera_model(model: ConfigDict) -> None:
         {
             # vit or resnet50.
             "kind": "vit",
-            # Height and width of the images in pixels, multiples of the patch size.
+            # Height and width of the images in pixels; the transformer resizes them to the
+            # nearest multiples of its patch size.
             "size": (720, 1280),
             # Keep the image backbone fixed.
             "freeze": True,
@@ -149,6 +156,8 @@ def _add_camera_model(model: ConfigDict) -> None:
             "gated_mlp": False,
             # Initial value of the layer scale; DINOv3's come with the weights.
             "layer_scale": 1.0,
+            # Patches per axis of DINOv2's position embedding; 0: DINOv3's rotary embedding.
+            "position_grid": 0,
             # Implementation of the attention: auto, or one of `radejax.models.vit`.
             "attention": "auto",
             # Channels of the ResNet's stem; 64 in ResNet-50.

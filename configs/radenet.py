@@ -16,7 +16,7 @@ The argument is a list of options, at most one of each group:
   the heatmap targets that the papers compare. It overrides the preset.
 - classes: `all` (default; five classes, v2.1 labels) or `sedan` (v1.1 labels).
 
-Table III reports (Sedan, narrow region, IoU 0.3):
+Table III reports (models with the option `sedan`, narrow region, IoU 0.3):
 
 | variant | AP 3D | AP BEV |
 |---|---|---|

@@ -11,6 +11,7 @@
 | sigma | widths of the Gaussians in the heatmap targets |
 | quickstart | the quickstart's input scaling and longer training |
 | camera | the quickstart with and without a camera |
+| frames | samples of two consecutive frames and of one |
 
 A variant is an ordinary run of a config, or the run of another variant evaluated with shuffled
 images. Runs are trained on the scenes of their seed and evaluated on held-out scenes, which are
@@ -51,6 +52,8 @@ from radejax.core import files
 from radejax.core.config import load_config
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
+from radejax.data.kradar.dataset import read_split
+from radejax.data.kradar.write import write_splits
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files import Source, load
 from radejax.evaluation.report import rendered
@@ -118,16 +121,27 @@ class Work:
         kind, name = cell.config.partition(":")[0], "held"
         if seed is not None:
             name = f"{self.config(cell, seed).simulation.train_sequences}-seed{seed}"
-        return self.out / "data" / f"{kind}-{name}"
+        count = self.study.frames_per_sequence
+        end = f"-{count}_frames" if count > 1 else ""
+        return self.out / "data" / f"{kind}-{name}{end}"
 
     def data(self, cell: Cell, seed: int | None) -> str:
         """Simulates the data of `root` if they are missing and returns their folder."""
         simulation = plain(self.config(cell, seed or 0).simulation)
         if seed is None:
-            simulation |= {"seed": HELD_OUT_SEED, "frames_per_sequence": 1}
+            count = self.study.frames_per_sequence
+            simulation |= {"seed": HELD_OUT_SEED, "frames_per_sequence": count}
             simulation |= {"train_sequences": 0, "test_sequences": self.study.held_out}
             simulation["vru_density_scale"] = 1.0  # only training scenes are scaled
-        return str(simulate_dataset(simulation, self.root(cell, seed)))
+        root = simulate_dataset(simulation, self.root(cell, seed))
+        if self.study.frames_per_sequence > 1:
+            keep_last_frames(root)
+        return str(root)
+
+    @property
+    def held_split(self) -> str:
+        """Split of the held-out scenes with the frames to evaluate."""
+        return "all" if self.study.frames_per_sequence == 1 else "test"
 
     def alone(self) -> contextlib.AbstractContextManager[None]:
         """Returns a lock to hold while data that all seeds share are made."""
@@ -166,7 +180,8 @@ class Work:
         parts.append(f"--data {data} --workdir RUN")
         if backbone := self.backbone(cell):
             parts.append(f"--image-backbone {os.path.relpath(backbone)}")
-        parts.append(f"&& python evaluate.py --workdir RUN --split all --data {held}")
+        end = f"--split {self.held_split} --data {held}"
+        parts.append(f"&& python evaluate.py --workdir RUN {end}")
         return " ".join([*parts, *["--shuffle-images 0"] * bool(cell.exchanges)])
 
     def make(self, name: str, seed: int) -> bool:
@@ -184,7 +199,7 @@ class Work:
         with self.alone():  # the held-out scenes are simulated and preprocessed once
             evaluate_run(
                 folder,
-                split="all",
+                split=self.held_split,
                 out=self.report(name, seed),
                 image_backbone=backbone,
                 shuffle_images=0 if cell.exchanges else None,
@@ -195,6 +210,15 @@ class Work:
         content = {"minutes": minutes, "command": self.command(name, seed)}
         files.write_json(self.report(name, seed) / "cell.json", content)
         return True
+
+
+def keep_last_frames(root: pathlib.Path) -> None:
+    """Reduces the splits of a simulated dataset to the last frame of every sequence."""
+    last = {}
+    for path in sorted(root.glob("split/*.txt")):
+        entries = dict(sorted(read_split(path)))
+        last[path.stem] = sorted(entries.items())
+    write_splits(root / "split", **last)
 
 
 # Comparing ----------------------------------------------------------------------------

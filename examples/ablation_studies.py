@@ -55,6 +55,8 @@ class Study:
             share a run, so they must be equal.
         claims: Claims to check.
         held_out: Number of held-out scenes, of one frame each.
+        frames_per_sequence: Frames of every sequence. If there are several, networks are
+            trained and evaluated on the last one; the others only precede it.
     """
 
     title: str
@@ -62,6 +64,7 @@ class Study:
     cells: Mapping[str, Cell]
     claims: tuple[Claim, ...]
     held_out: int
+    frames_per_sequence: int = 1
 
 
 def _radar(**fields: Any) -> Cell:
@@ -181,5 +184,22 @@ STUDIES = {
             ),
         ),
         1024,
+    ),
+    "frames": Study(
+        "two frames against one",
+        "one frame",
+        {
+            "one frame": _radar(simulation__frames_per_sequence=2),
+            "two frames": _radar(simulation__frames_per_sequence=2, data__num_frames=2),
+        },
+        (
+            *(
+                Claim(f"the preceding frame helps {cls}", "two frames", "one frame", cls)
+                for cls in CLASSES
+            ),
+            Claim("it does in the mean", "two frames", "one frame", "mean"),
+        ),
+        1024,
+        2,
     ),
 }  # fmt: skip

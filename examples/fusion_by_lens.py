@@ -26,7 +26,12 @@ from radejax.evaluation.boxes import frame_keys
 from radejax.evaluation.comparison import compare
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files import Source, load
-from radejax.evaluation.results import interval, repair_sizes, sequence_weights
+from radejax.evaluation.results import (
+    EvaluationOptions,
+    interval,
+    repair_sizes,
+    sequence_weights,
+)
 from radejax.inference.saved import load_model as open_model
 from radejax.runs.data import data_name, data_of_run
 from radejax.runs.figures import average_shares, frame_shares, mean_share
@@ -120,15 +125,14 @@ def rows_of_group(name, reports, config, chosen, resamples):
         evaluation_set(report, tuple(config.classes), tuple(options.roi), chosen)
         for report in reports
     )
-    found = compare(
-        radar[0],
-        fusion[0],
-        radar[1],
-        protocol_names=("all_point",),
-        spaces=("bev",),
-        score_threshold=options.score_threshold,
-        resamples=resamples,
+    settings = EvaluationOptions.from_config(
+        config,
+        protocols=("all_point",),
+        min_score=options.score_threshold,
+        bootstrap=resamples,
     )
+    runs = {"": radar[0]}, {"": fusion[0]}
+    found = compare(*runs, {"sequence": radar[1]}, settings, spaces=("bev",))
     return [
         {
             "condition": name,
@@ -141,7 +145,7 @@ def rows_of_group(name, reports, config, chosen, resamples):
             "high": row.high,
         }
         for row in found
-        if row.cls in ("Sedan", "mean")
+        if row.kind == "all" and row.cls in ("Sedan", "mean")
     ]
 
 

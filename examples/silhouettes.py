@@ -16,10 +16,9 @@ import click
 
 from radejax.cli import entry
 from radejax.core.config import load_config
-from radejax.evaluation.comparison import compare, comparison_table
-from radejax.evaluation.evaluation_set import EvaluationSet
+from radejax.evaluation.comparison import compare, comparison_tables
 from radejax.evaluation.files import Source, load
-from radejax.evaluation.results import repair_sizes
+from radejax.evaluation.results import EvaluationOptions, make_set
 from radejax.runs import experiment
 
 CONFIG = (
@@ -37,21 +36,18 @@ def is_met(rows, min_gain=MIN_GAIN):
 
 def compared(config, radar, fusion, resamples):
     """Returns the rows of the comparison of two evaluated workdirs."""
-    sets = []
-    for folder in (radar, fusion):
-        truth, found, frames, _ = load(folder / "evaluation", Source(), config.classes)
-        found, _ = repair_sizes(found, "false_positive")
-        settings = {"classes": tuple(config.classes), "frames": frames}
-        roi = tuple(config.evaluation.roi)
-        sets.append(EvaluationSet(truth, found, roi=roi, **settings))
-    return compare(
-        *sets,
-        frames["sequence"],
-        protocol_names=("all_point",),
-        spaces=("bev",),
-        score_threshold=config.evaluation.score_threshold,
-        resamples=resamples,
+    options = EvaluationOptions.from_config(
+        config,
+        protocols=("all_point",),
+        min_score=config.evaluation.score_threshold,
+        bootstrap=resamples,
     )
+    runs = []
+    for folder in (radar, fusion):
+        truth, found, frames, _ = load(folder / "evaluation", Source(), options.classes)
+        runs.append({"": make_set(truth, found, frames, options)})
+    rows = compare(*runs, frames, options, spaces=("bev",))
+    return [row for row in rows if row.kind == "all"]
 
 
 @click.command()
@@ -76,7 +72,7 @@ def main(workdir, options, seed, resamples):
             folder = pathlib.Path(workdir) / kind
             folders.append(experiment.run(config, folder))
         rows = compared(config, *folders, resamples)
-        table = comparison_table(rows, "radar", "radar and silhouettes")
+        (table,) = comparison_tables(rows, "radar", "radar and silhouettes")
         click.echo(table.render(is_simulated=True))
         click.echo(
             f"gain of +{MIN_GAIN:g} in the mean: {'yes' if is_met(rows) else 'no'}"

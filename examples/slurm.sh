@@ -1,39 +1,51 @@
 #!/usr/bin/env bash
 #SBATCH --job-name=radejax
-#SBATCH --nodes=2
-#SBATCH --ntasks-per-node=4
-#SBATCH --gpus-per-node=4
+#SBATCH --nodes=1
+#SBATCH --ntasks-per-node=2
+#SBATCH --gpus-per-node=2
 #SBATCH --cpus-per-task=8
 #SBATCH --time=24:00:00
-#SBATCH --signal=TERM@120
+#SBATCH --signal=B:USR1@120
 #SBATCH --requeue
 #SBATCH --open-mode=append
 #SBATCH --output=slurm-%j.out
-# RADE-Net on eight GPUs of two nodes: one process a GPU, found by JAX from Slurm's
-# variables. 120 s before the time is over (--signal), or when the job is preempted, all
-# processes save a checkpoint and stop; started again, the run continues there.
+# Trains a config with its own batch size and precision on two GPUs, one process per GPU.
+# Further arguments are options of `radejax train`:
 #
-#     sbatch --export=ALL,DATA=/data/kradar1,WORKDIR=$HOME/runs/radenet examples/slurm.sh
+#     sbatch --export=ALL,DATA=/data/kradar1,WORKDIR=$HOME/runs/radenet \
+#         examples/slurm.sh --seeds 0,1,2
 #
-# WORKDIR and the records (beside the data, or RECORDS) lie on a disk that all nodes see.
-# The global batch must divide over the GPUs: eight of the paper's ten frames here.
+# CONFIG names the config (default: radenet), whose batch size must be divisible by the
+# number of GPUs: 10 for radenet, 6 for dinorade. WORKDIR and RECORDS (default: beside the
+# data) must be on a disk that all nodes share.
 set -euo pipefail
 : "${DATA:?folders of K-Radar, separated by commas}" "${WORKDIR:?folder of the run}"
-records=${RECORDS:-${DATA%%,*}/records}
 
-run() {
-    srun --kill-on-bad-exit=1 python train.py --distributed \
-        --config configs/radenet.py --config.train.batch_size=8 \
-        --config.model.dtype=bfloat16 \
-        --data "$DATA" --records "$records" --workdir "$WORKDIR"
+# Slurm sends USR1 to this script 120 s before the time limit. The processes then receive
+# SIGTERM, save a checkpoint and stop, and the job returns to the queue. A run that ends by
+# itself, with or without an error or an evaluation, is never queued again. After a
+# preemption or the failure of a node, Slurm requeues the job (--requeue).
+is_stopped=false
+stop() {
+    is_stopped=true
+    scancel --signal=TERM "$SLURM_JOB_ID" # signals the processes, not this script
 }
+trap stop USR1
 
+# Since Slurm 22.05, srun does not take --cpus-per-task from sbatch.
+srun --cpus-per-task="$SLURM_CPUS_PER_TASK" --kill-on-bad-exit=1 \
+    radejax train --distributed --config "${CONFIG:-radenet}" --data "$DATA" \
+    --records "${RECORDS:-${DATA%%,*}/records}" --workdir "$WORKDIR" "$@" &
+process=$!
 status=0
-run || status=$?
-# Stopped by a signal, in training (0, and there is no evaluation yet) or in the final
-# evaluation (143 = 128 + SIGTERM): back into the queue. Errors are not tried again.
-if [ "$status" = 143 ] ||
-    { [ "$status" = 0 ] && [ ! -e "$WORKDIR/evaluation/metrics.json" ]; }; then
+wait "$process" || status=$?
+if $is_stopped; then # the signal ended the first `wait`
+    status=0
+    wait "$process" || status=$?
+fi
+
+# 143 = 128 + SIGTERM: stopped in the final evaluation, which the next start repeats.
+if $is_stopped && [[ $status == 0 || $status == 143 ]]; then
     scontrol requeue "$SLURM_JOB_ID"
 fi
 exit "$status"

@@ -88,14 +88,15 @@ def camera_config() -> ConfigDict:
 
 
 @functools.lru_cache(maxsize=4)
-def _variables(kind: str) -> Any:
+def _variables(kind: str, num_frames: int) -> Any:
     """Random variables: initial zeros would hide the values that they multiply."""
     config = {"radar": radar_config, "camera": camera_config}[kind]()
-    inputs = [np.zeros((1, *small_grid().projection_shape), np.float32)]
+    *bins, channels = small_grid().projection_shape
+    inputs = [np.zeros((1, *bins, num_frames * channels), np.float32)]
     if kind == "camera":
         inputs.append(np.zeros((1, *IMAGE_SIZE, 3), np.uint8))
         inputs.append(stack_cameras([calibration().camera()]))
-    return drawn(models.build(config.model), *inputs)
+    return drawn(models.build(config.model, num_frames), *inputs)
 
 
 def drawn(module: nn.Module, *inputs: Any, seed: int = 0) -> Any:
@@ -117,9 +118,9 @@ def drawn(module: nn.Module, *inputs: Any, seed: int = 0) -> Any:
     return jax.tree_util.tree_map_with_path(fill, shapes)
 
 
-def detector(kind: str = "radar", **overrides: Any) -> Detector:
+def detector(kind: str = "radar", *, num_frames: int = 1, **overrides: Any) -> Detector:
     options = {"batch_sizes": (4,), "score_threshold": 0.1} | overrides
-    return Detector(saved(kind), **options)
+    return Detector(saved(kind, data__num_frames=num_frames), **options)
 
 
 def saved(kind: str = "radar", **changes: Any) -> SavedModel:
@@ -128,7 +129,8 @@ def saved(kind: str = "radar", **changes: Any) -> SavedModel:
     config.update_from_flattened_dict(
         {name.replace("__", "."): value for name, value in changes.items()}
     )
-    return SavedModel(config, small_grid(), _variables(kind))
+    variables = _variables(kind, config.data.num_frames)
+    return SavedModel(config, small_grid(), variables)
 
 
 def projections(count: int) -> np.ndarray:

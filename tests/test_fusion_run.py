@@ -10,6 +10,7 @@ import shutil
 import jax
 import numpy as np
 import pytest
+import safetensors.numpy
 from click.testing import CliRunner
 
 from radejax.cli.main import main
@@ -155,6 +156,38 @@ def test_training_from_embeddings_is_the_same(data, from_images, embeddings, tmp
     evaluate_run(workdir, other=given, num_visualizations=0)
     report = json.loads((workdir / "evaluation_other/metrics.json").read_text())
     assert report["ap"] == reports[0]["ap"]
+
+
+def test_dinov2_embeds_and_trains_like_dinov3(data, golden, tmp_path):
+    # 32 x 96 pixels are no multiples of the patch size: the model resizes them to 28 x 98.
+    seeds = load_module(golden / "backbones_make.py")
+    info = json.loads(str(np.load(golden / "backbones.npz")["info"]))
+    listing = info["dinov2_registers"]
+    backbone, embeddings = tmp_path / "dinov2", tmp_path / "embeddings"
+    backbone.mkdir()
+    (backbone / "config.json").write_text(json.dumps(listing["config"]))
+    safetensors.numpy.save_file(
+        seeds.tensors(listing["tensors"]), backbone / "model.safetensors"
+    )
+
+    def config():
+        changed = small_config()
+        changed.model.image.update(hidden_size=32, num_layers=2, num_heads=2)
+        changed.model.image.update(mlp_dim=128, patch_size=14, position_grid=4)
+        return changed
+
+    with pytest.raises(UserError, match=r"dinov3 is DINOv3, .* 16 there and 14 here"):
+        data.train("other", config(), image_backbone=str(data.backbone))
+    images = data.train("dinov2_images", config(), image_backbone=str(backbone))
+    path = small.write_config(tmp_path / "config.py", config())
+    arguments = ["embed", str(data.folder), "--config", str(path), "--out"]
+    arguments += [str(embeddings), "--image-backbone", str(backbone)]
+    result = CliRunner().invoke(main, arguments, catch_exceptions=False)
+    assert "12 frames, 12 embedded" in result.output
+    assert open_embeddings(embeddings).shape == (2, 7, 32)
+    embedded = data.train("dinov2_embedded", config(), embeddings=str(embeddings))
+    found, wanted = data.losses(embedded), data.losses(images)
+    np.testing.assert_allclose(found, wanted, rtol=2e-5)
 
 
 def test_a_run_that_starts_from_another_keeps_its_backbone(data, from_images):

@@ -26,7 +26,7 @@ from radejax.core.errors import UserError
     "--frames",
     "frames_per_sequence",
     type=click.IntRange(0),
-    help="Frames per sequence; 0 = all labelled frames.",
+    help="Frames per sequence, of both splits with --scenes; 0 = all labelled frames.",
 )
 @click.option(
     "--full-size", is_flag=True, help="K-Radar's own grid and images of 2560 x 720."
@@ -158,7 +158,7 @@ def preprocess(
     "--image-backbone",
     required=True,
     type=entry.EXISTING,
-    help="DINOv3 folder from Hugging Face, or torchvision's ResNet-50 file.",
+    help="DINOv3 (folder or file), DINOv2 folder, or torchvision's ResNet-50 file.",
 )
 @click.option(
     "--out", required=True, type=entry.FOLDER, help="Folder of the embeddings."

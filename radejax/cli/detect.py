@@ -69,6 +69,8 @@ def detect(
     text = f"{count['boxes']} boxes in {count['frames']} frames written to {out}"
     if count["clipped"]:
         text += f"; {count['clipped']} with a size that was clipped to be positive"
+    if "repeated" in count:
+        text += f"; {count['repeated']} without a preceding frame, which were repeated"
     if "radar_only" in count:
         text += f"; {count['radar_only']} without an image, from the radar only"
     entry.echo_result(as_json, {**count, "out": str(out)}, text)

@@ -324,8 +324,8 @@ step = click.option(
 image_backbone = click.option(
     "--image-backbone",
     type=EXISTING,
-    help="Weights of a frozen image backbone: a DINOv3 folder from Hugging Face or "
-    "torchvision's ResNet-50 file.",
+    help="Weights of a frozen image backbone: a DINOv3 or DINOv2 folder from Hugging Face, "
+    "a DINOv3 file of Meta or timm, or torchvision's ResNet-50 file.",
 )
 max_frames = click.option(
     "--max-frames",

@@ -80,6 +80,8 @@ _SETTINGS = together(
     ),
     group="Metrics",
 )
+_FORMAT = click.Choice(["png", "pdf"])
+_FIGURES = click.option("--figures", type=_FORMAT, help="Format. Default: png.")
 _PREDICTIONS = together(
     click.option(
         "--ground-truth",
@@ -126,6 +128,7 @@ _OTHER_DATA = (
 @click.option(
     "--num-visualizations", type=click.IntRange(0), help="Number of frames to draw."
 )
+@_FIGURES
 @_SETTINGS
 @entry.json_option
 def evaluate(
@@ -157,6 +160,8 @@ def evaluate(
 @click.option("--name", help="Name of the run in tables.")
 @_DATA
 @_PREDICTIONS
+@_FIGURES
+@click.option("--kitti", is_flag=True, help="Also write files for K-Radar's script.")
 @_SETTINGS
 @entry.json_option
 def score(
@@ -164,8 +169,9 @@ def score(
 ) -> None:
     """Evaluate predictions in files.
 
-    PREDICTIONS is a .npz or .json file, a folder of `radejax detect`, or a folder of text
-    files as K-Radar's tools write them. Ground truth: --data (K-Radar), --labels (a label
+    PREDICTIONS is a .npz or .json file, a folder of `radejax detect`, a folder of text
+    files as K-Radar's tools write them, or the folder of a run or report, whose options are
+    the defaults. Ground truth: --data (K-Radar), --labels (a label
     revision without radar data), --ground-truth (a file), or the folder's own.
 
     Example: radejax score found.json --data /data/kradar --out results
@@ -174,13 +180,15 @@ def score(
 
     path = pathlib.Path(predictions)
     folder = out or path.with_name(f"{path.stem}_evaluation")
-    source, settings = _source_and_settings(options, bootstrap=200)
+    source, settings = _settings(path, _given(options), bootstrap=200)
     report = evaluate_files(path, folder, source, settings, run=name or path.stem)
     entry.echo_result(as_json, report.metrics, f"{report.text}\nWritten to {folder}")
 
 
 @click.command(cls=entry.Command)
-@click.argument("runs", nargs=-1, type=entry.EXISTING, metavar="A B [C ...]")
+@click.argument(
+    "runs", nargs=-1, required=True, type=entry.EXISTING, metavar="A B [C ...]"
+)
 @click.option("--out", help="Folder to write the comparison to. Default: none.")
 @_DATA
 @_PREDICTIONS
@@ -191,13 +199,14 @@ def compare(
 ) -> None:
     """Compare runs with the first of them.
 
-    Each is the folder of a report, or predictions as `radejax score` takes them.
+    Each is the folder of a run, of its seeds or of a report, or predictions as `radejax
+    score` takes them. With three seeds or more of both runs, differences are tested.
 
-    Example: radejax compare runs/a/evaluation runs/b/evaluation
+    Example: radejax compare runs/a runs/b
     """
     from radejax.evaluation.comparison import compare_files
 
-    source, settings = _source_and_settings(options, bootstrap=2000)
+    source, settings = _settings(runs[0], _given(options), bootstrap=2000)
     text, rows = compare_files(runs, out, source, settings)
     entry.echo_result(as_json, rows, text.rstrip("\n"))
 
@@ -212,12 +221,18 @@ def _given(options: dict[str, Any]) -> dict[str, Any]:
     return given
 
 
-def _source_and_settings(options: dict[str, Any], bootstrap: int) -> tuple[Any, Any]:
-    """Builds `Source` and `EvaluationOptions` from the options that are their fields."""
-    from radejax.evaluation.files import Source
+def _settings(path: Any, given: dict[str, Any], bootstrap: int) -> tuple[Any, Any]:
+    """Builds `Source` and `EvaluationOptions` from the options that are their fields.
+
+    Options that are not given are those of the report in `path` or of the ground truth.
+    """
+    from radejax.evaluation.files import Source, stored_options
     from radejax.evaluation.results import EvaluationOptions
 
-    values = {"label_version": "v2.1", "bootstrap": bootstrap} | _given(options)
+    values: dict[str, Any] = {"label_version": "v2.1"}
+    for place in filter(None, (given.get("ground_truth"), path)):
+        values |= stored_options(place)
+    values |= {"bootstrap": bootstrap} | given
 
     def made(kind: Any) -> Any:
         names = [field.name for field in dataclasses.fields(kind)]

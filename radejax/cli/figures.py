@@ -31,6 +31,11 @@ MODEL = pathlib.Path(__file__).with_name("demo_model")
     help="Draw range-azimuth, range-Doppler and azimuth-elevation maxima.",
 )
 @click.option(
+    "--lidar",
+    is_flag=True,
+    help="Draw the points of os2-64/*.pcd on radar map and image, to check calibrations.",
+)
+@click.option(
     "--roi",
     type=click.Choice(["narrow", "wide", "none"]),
     default="narrow",
@@ -42,6 +47,7 @@ def overlay(
     roots: tuple[str, ...],
     out: pathlib.Path,
     slices: bool,
+    lidar: bool,
     roi: str,
     max_frames: int | None,
     **part: Any,
@@ -67,6 +73,8 @@ def overlay(
         part["sequence_numbers"] = (int(sequence),)
     elif name or not (part["sequence_numbers"] or part["weather"]):
         raise UserError(f"frame {name!r}, expected sequence/radar_lidar: 1/00033_00001")
+    if slices and lidar:
+        raise UserError("--slices shows no LiDAR points: leave out --lidar or --slices")
     frames = radejax.KRadar(roots, visibility=None, **part)
     if not len(frames):
         raise UserError("no frames of these sequences and weathers")
@@ -82,23 +90,28 @@ def overlay(
         )
     if out.suffix.lower() in ANIMATIONS:
         shown = tqdm.tqdm(found[:max_frames], "draw", unit="frame")
-        animate((_draw(frame, frames.grid, slices, roi) for frame in shown), out)
+        animate((_draw(frames, frame, slices, lidar, roi) for frame in shown), out)
     else:
-        save_figure(_draw(found[0], frames.grid, slices, roi), out)
+        save_figure(_draw(frames, found[0], slices, lidar, roi), out)
     click.echo(f"drew {out}")
 
 
-def _draw(frame: Any, grid: Any, slices: bool, roi: str) -> Any:
+def _draw(frames: Any, frame: Any, slices: bool, lidar: bool, roi: str) -> Any:
     """Draws one frame: slices of the projection, or the radar map and camera image.
 
     Raises:
-        FileNotFoundError: The frame has neither a tensor nor a projection.
+        FileNotFoundError: The frame has neither a tensor nor a projection, or no LiDAR scan
+            is there that is to be drawn.
     """
     from radejax.core.structures import ROIS
+    from radejax.data.points import read_lidar
     from radejax.visualize.draw import draw_slices
 
-    projection = frame.read_projection(grid)
-    scene = radejax.frame_scene(frame, projection, grid, roi=ROIS.get(roi))
+    grid, fields = frames.grid, dict[str, Any](roi=ROIS.get(roi))
+    if lidar:
+        points_m = read_lidar(frames.lidar_path(frame))
+        fields["lidar_m"] = points_m + frame.radar_from_lidar_m
+    scene = radejax.frame_scene(frame, frame.read_projection(grid), grid, **fields)
     return draw_slices(scene) if slices else radejax.draw_frame(scene)
 
 

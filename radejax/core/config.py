@@ -229,6 +229,9 @@ _FIELDS: dict[str, Any] = {
         "batch_size": 10,
         # Passes over the training data; at least 1.
         "num_epochs": 10,
+        # Steps after which the training ends if its epochs are longer, at least 1; the
+        # learning rate decreases over the steps that are taken. None: all epochs.
+        "max_steps": placeholder(int),
         # Peak learning rate of AdamW; above 0.
         "learning_rate": 1e-3,
         # Final learning rate, from 0 to the peak.
@@ -294,6 +297,9 @@ _FIELDS: dict[str, Any] = {
         "validation": (),
         # Seed with which a fraction is drawn; independent of `seed`.
         "validation_seed": 0,
+        # Frames of a sample: the frame and those that precede it in its sequence, whose
+        # channels are concatenated; at least 1.
+        "num_frames": 1,
         # Number of objects to which each frame is padded; K-Radar v2.1 has at most 14.
         "max_objects": 32,
         # Mapping of azimuth bins to angles: true, or stretched for official checkpoints.

@@ -70,7 +70,7 @@ class Batch(struct.PyTreeNode):
 
     Attributes:
         projection: Normalized projections as they are stored: D Doppler channels, then E
-            elevation channels.
+            elevation channels; of every frame of a sample, see `stack_frames`.
         boxes: x, y, z, l, w, h, sin yaw, cos yaw; l, w and h are full extents; float32.
         classes: int32 class indices; any value where not `is_valid`.
         is_valid: True where a box is an object and not padding.

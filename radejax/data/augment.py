@@ -1,4 +1,4 @@
-"""Augmentation of single frames, consistent for radar, boxes, image and camera.
+"""Augmentation of single samples, consistent for radar, boxes, image and camera.
 
 It is off by default, as the papers train without augmentation. Mirroring is exact on
 every grid whose azimuth axis is symmetric.
@@ -16,7 +16,7 @@ from radejax.geometry.camera import Camera
 from radejax.geometry.radar_grid import RadarGrid
 
 Sample = dict[str, Any]
-"""One frame: projection `[R, A, D+E]`, boxes `[N, 8]`, image and camera or None."""
+"""One sample: projection `[R, A, C]`, boxes `[N, 8]`, image and camera or None."""
 
 
 @dataclasses.dataclass(frozen=True)

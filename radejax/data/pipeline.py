@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import grain
@@ -22,6 +23,7 @@ from radejax.core.structures import CLASSES, Batch
 from radejax.data.augment import Augmentation
 from radejax.data.cameras import CameraOptions, no_camera, read_left_image
 from radejax.data.dataset import FrameSequence, LabelledFrame
+from radejax.data.projection import stack_frames
 from radejax.data.records import Records
 from radejax.geometry.boxes import boxes8_from_7
 from radejax.geometry.camera import Camera, stack_cameras
@@ -189,6 +191,70 @@ def require_images(
     )
 
 
+# Consecutive frames ------------------------------------------------------------------
+
+
+def frame_histories(keys: Iterable[str], num_frames: int) -> dict[str, tuple[str, ...]]:
+    """Returns the keys of the frames of every sample, oldest first.
+
+    A sample is a frame and the `num_frames - 1` frames that precede it in its sequence,
+    where the number at the start of the names increases by one. If one of them is missing,
+    the frame that follows it is repeated in place of it and of all earlier frames.
+
+    Args:
+        keys: Keys of all frames that there are.
+        num_frames: Number of frames of a sample.
+
+    Raises:
+        UserError: A name does not start with a number.
+
+    Examples:
+        >>> frame_histories(["1/00007_00001", "1/00008_00002"], 2)["1/00008_00002"]
+        ('1/00007_00001', '1/00008_00002')
+    """
+    numbered = []
+    for key in keys:
+        sequence, _, name = key.rpartition("/")
+        number = re.match("[0-9]+", name)
+        if number is None:
+            raise UserError(
+                f"frame {key}: config.data.num_frames={num_frames} needs names that start "
+                "with the number of the frame in its sequence, such as 00033_00001"
+            )
+        numbered.append((sequence, int(number[0]), key))
+    histories, latest = {}, dict[tuple[str, int], tuple[str, ...]]()
+    for sequence, index, key in sorted(numbered):
+        before = latest.get((sequence, index - 1), (key,) * num_frames)
+        histories[key] = latest[sequence, index] = (*before[1:], key)
+    return histories
+
+
+def sample_keys(
+    records: Records, frames: FrameSequence, num_frames: int
+) -> tuple[tuple[str, ...], ...]:
+    """Returns the keys of the records of every sample, oldest first.
+
+    A preceding frame may be any frame that has a record, such as one of another split.
+    The number of samples that repeat a frame is logged.
+    """
+    if num_frames == 1:
+        return tuple((frame.key,) for frame in frames)
+    histories = frame_histories(records.keys(), num_frames)
+    keys = tuple(histories[frame.key] for frame in frames)
+    _log.info(
+        "%d of %d samples of %d frames repeat one, as a preceding frame is missing",
+        sum(len(set(sample)) < num_frames for sample in keys),
+        len(keys),
+        num_frames,
+    )
+    return keys
+
+
+def read_sample(records: Records, keys: Sequence[str]) -> Real[np.ndarray, "R A C"]:
+    """Reads the projections of the frames of a sample and concatenates their channels."""
+    return stack_frames([records[key] for key in keys], records.grid.num_doppler)
+
+
 # Batches -----------------------------------------------------------------------------
 
 
@@ -198,14 +264,14 @@ class FrameTable:
 
     Attributes:
         records: Projections of these frames and possibly others.
-        keys: Key of each frame's record.
+        keys: Keys of the records of each frame's sample, see `sample_keys`.
         boxes: float32 x, y, z, l, w, h, sin yaw, cos yaw, padded with zeros.
         classes: int32 class indices, padded with -1.
         images: Images and cameras of the frames, or None for radar-only models.
     """
 
     records: Records
-    keys: tuple[str, ...]
+    keys: tuple[tuple[str, ...], ...]
     boxes: Float[np.ndarray, "F N 8"]
     classes: Int[np.ndarray, "F N"]
     images: CameraInputs | None = None
@@ -221,6 +287,7 @@ def make_table(
     max_objects: int,
     classes: Sequence[str] = CLASSES,
     images: CameraInputs | None = None,
+    num_frames: int = 1,
 ) -> FrameTable:
     """Builds the padded label table of the frames, with their records.
 
@@ -232,6 +299,7 @@ def make_table(
             are not targets and are left out.
         images: Camera inputs of the same frames in the same order (see
             `camera_inputs`), or None for radar-only models.
+        num_frames: Number of frames of a sample, see `frame_histories`.
 
     Raises:
         UserError: A frame has more than `max_objects` objects (the message states the
@@ -258,7 +326,7 @@ def make_table(
         rows = np.flatnonzero(kept[i])
         boxes[i, : len(rows)] = boxes8_from_7(frame.boxes[rows])
         indices[i, : len(rows)] = [class_index[frame.classes[row]] for row in rows]
-    keys = tuple(frame.key for frame in frames)
+    keys = sample_keys(records, frames, num_frames)
     return FrameTable(records, keys, boxes, indices, images)
 
 
@@ -413,7 +481,7 @@ class _LoadBatch(grain.transforms.Map):
         """Returns one frame; image and camera are None for radar-only models."""
         table, images = self._table, self._table.images
         return {
-            "projection": table.records[table.keys[index]],
+            "projection": read_sample(table.records, table.keys[index]),
             "boxes": table.boxes[index],
             "image": None if images is None else images.image(index),
             "camera": None if images is None else images.cameras[index],
@@ -423,8 +491,10 @@ class _LoadBatch(grain.transforms.Map):
         """Returns a batch that contains only padding."""
         records, images = self._table.records, self._table.images
         rows = (size, self._table.boxes.shape[1])
+        *bins, channels = records.shape
+        channels *= len(self._table.keys[0])
         return Batch(
-            projection=np.zeros((size, *records.shape), records.dtype),
+            projection=np.zeros((size, *bins, channels), records.dtype),
             boxes=np.zeros((*rows, 8), np.float32),
             classes=np.full(rows, -1, np.int32),
             is_valid=np.zeros(rows, bool),

@@ -1,15 +1,21 @@
-"""Point clouds from projections by cell-averaging CFAR."""
+"""Point clouds: radar points by cell-averaging CFAR, and LiDAR scans of K-Radar."""
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import uniform_filter  # type: ignore[attr-defined]
 
+from radejax.core.archives import wrap_read_errors
+from radejax.core.errors import DataError
+from radejax.core.files import PathLike, as_path
 from radejax.data.projection import LOG_OFFSET_DB, LOG_SCALE_DB
 from radejax.geometry.radar_grid import RadarGrid
+
+_MAX_HEADER_LINES = 20
 
 
 class Points(NamedTuple):
@@ -89,3 +95,35 @@ def local_mean_db(
     guard = uniform_filter(power, inner, mode="nearest") * inner**2
     mean = (whole - guard) / (outer**2 - inner**2)
     return 10.0 * np.log10(np.maximum(mean, 1e-10))
+
+
+def read_lidar(path: PathLike) -> Float[np.ndarray, "N 3"]:
+    """Reads x, y, z in meters in the LiDAR frame from an ASCII PCD file.
+
+    Rays without an echo, whose coordinates are 0 or not finite, are left out.
+
+    Args:
+        path: File such as K-Radar's `os2-64/os2-64_00001.pcd`.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        DataError: The file is incomplete, or has another header.
+    """
+    with wrap_read_errors(path, "an ASCII PCD file"), open(as_path(path)) as file:
+        header = dict[str, str]()
+        for line in itertools.islice(file, _MAX_HEADER_LINES):
+            name, _, header[name] = line.strip().partition(" ")
+            if name == "DATA":
+                break
+        fields, kind = header.get("FIELDS", "none"), header.get("DATA", "none")
+        if fields.split()[:3] != ["x", "y", "z"] or kind != "ascii":
+            raise DataError(
+                f"{path}: PCD header with FIELDS {fields[:80]} and DATA {kind[:80]}, "
+                "expected FIELDS x y z ... and DATA ascii, as in K-Radar's os2-64"
+            )
+        points = np.loadtxt(file, usecols=(0, 1, 2), ndmin=2)
+        if len(points) != int(header.get("POINTS", -1)):
+            raise DataError(
+                f"{path}: {len(points)} points, the header says {header.get('POINTS')}"
+            )
+    return points[np.isfinite(points).all(1) & points.any(1)]

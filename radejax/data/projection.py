@@ -9,7 +9,7 @@ which reads each cell from memory only once if it follows the tensor's memory or
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import chex
@@ -196,6 +196,27 @@ def project_jax(
 
 
 # Storage and network input --------------------------------------------------------
+
+
+def stack_frames(
+    frames: Sequence[Real[np.ndarray, "*axes DE"]], num_doppler: int
+) -> Real[np.ndarray, "*axes C"]:
+    """Concatenates the channels of consecutive frames to the input of a network.
+
+    Args:
+        frames: Projections of one or several frames, oldest first.
+        num_doppler: Number of their Doppler channels.
+
+    Returns:
+        The Doppler channels of all frames, then their elevation channels. A single frame
+        is returned unchanged.
+    """
+    if len(frames) == 1:
+        return frames[0]
+    doppler = [frame[..., :num_doppler] for frame in frames]
+    elevation = [frame[..., num_doppler:] for frame in frames]
+    return np.concatenate([*doppler, *elevation], axis=-1)
+
 
 ENCODINGS = ("float16", "uint8", "float32")
 

@@ -99,6 +99,21 @@ def _by_distance(data: EvaluationSet, match: Int[np.ndarray, " M"]) -> Masks:
     return bands
 
 
+def distance_sets(data: EvaluationSet, iou: float) -> dict[str, EvaluationSet]:
+    """Returns the evaluation set of each distance band of `subsets`.
+
+    In `all_point` and 3D, predictions match the same objects as among all boxes.
+
+    Examples:
+        >>> car = {"frame": [0], "box": [[20.0, 0, 0, 4, 2, 1.5, 0]], "cls": ["Sedan"]}
+        >>> data = EvaluationSet(car, {**car, "score": [0.9]}, classes=["Sedan"])
+        >>> len(distance_sets(data, 0.5)["20-40 m"].gt)
+        1
+    """
+    bands = _by_distance(data, matched_objects(data, "3d", iou))
+    return {name: data.of_boxes(*both, data.frame) for name, both in bands.items()}
+
+
 def _numbers(
     data: EvaluationSet,
     cls: int,

@@ -1,7 +1,16 @@
 """Comparisons of runs on the same frames (`radejax compare`).
 
-Both runs of a comparison are evaluated on the same resampled sequences (see
-`evaluation.results`).
+All trainings of both runs are evaluated on the same resampled sequences (see
+`evaluation.results`). With `MIN_SEEDS` seeds or more of both runs, the variance between
+trainings is added, as estimated from the seeds. This is the variance of resampling n - 1 of
+n seeds. A percentile interval over resampled seeds would be too narrow, because three
+differences have the same sign in one of four cases. Therefore intervals and p-values use
+critical values of Student's distribution: the mean of those of seeds and of sequences,
+weighted by their variances (Cochran).
+
+References:
+    Cochran: "Approximate significance levels of the Behrens-Fisher test", Biometrics 1964.
+    Rao, Wu: "Resampling inference with complex survey data", JASA 1988.
 """
 
 from __future__ import annotations
@@ -9,27 +18,38 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Float
+from scipy.special import stdtrit
 
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.core.files import PathLike
-from radejax.evaluation import protocols
+from radejax.evaluation import protocols, report
+from radejax.evaluation.analysis import distance_sets
+from radejax.evaluation.boxes import Columns
 from radejax.evaluation.evaluation_set import SPACES, EvaluationSet
-from radejax.evaluation.files import Source, load, stored_from
-from radejax.evaluation.report import Table, numbers, plain, rendered
+from radejax.evaluation.files import Source, load, report_folders, stored_options
 from radejax.evaluation.results import (
     LEVEL,
     EvaluationOptions,
+    condition_masks,
     interval,
     make_set,
     resample,
     sequence_weights,
 )
+
+MIN_SEEDS = 3
+"""Number of seeds that both runs need for a test of their difference."""
+
+Aps = Float[np.ndarray, "_ _"]
+
+Run = Mapping[str, EvaluationSet]
+"""Evaluation sets of the trainings of a run by the names of their seeds."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,107 +57,156 @@ class Comparison:
     """Comparison of run B with run A in one metric.
 
     Attributes:
+        kind: Kind of the condition: "all", "weather" or "distance".
+        condition: "all", a weather, or a distance band of the report.
         cls: Class name or "mean".
         space: "bev" or "3d".
         iou: IoU threshold.
         protocol: Name of the protocol.
-        ap_a: AP of run A over all frames.
-        ap_b: AP of run B over all frames.
+        score_threshold: Score threshold of the protocol.
+        ap_a: AP of run A over all frames of the condition; the mean over its seeds.
+        ap_b: AP of run B in the same way.
         difference: AP of run B minus AP of run A.
-        low: Lower end of the 95 % interval of the difference.
+        std: Standard deviation of the difference over seeds; NaN if it is not tested.
+        low: Lower end of the 95 % interval of the difference; NaN with a single sequence.
         high: Upper end of this interval.
-        p_value: Two-sided p-value from the fraction of resamples in which the difference
-            has the less frequent sign.
-        p_adjusted: p-value after Holm's correction over all rows compared together.
-        is_significant: Whether `p_adjusted` is below 0.05.
+        p_value: Two-sided p-value. If the difference is not tested, it is computed from
+            the fraction of resamples in which the difference has the less frequent sign.
+        p_adjusted: p-value after Holm's correction over all rows of the same kind; for
+            weathers and distances not below the smallest one over all frames, so that
+            equal runs differ in any row with a probability of at most 5 %.
+        is_significant: Whether `p_adjusted` is below 0.05; None if the difference is not
+            tested, because a run has fewer than `MIN_SEEDS` seeds.
     """
 
+    kind: str
+    condition: str
     cls: str
     space: str
     iou: float
     protocol: str
+    score_threshold: float
     ap_a: float
     ap_b: float
     difference: float
+    std: float
     low: float
     high: float
     p_value: float
     p_adjusted: float = 1.0
-    is_significant: bool = False
+    is_significant: bool | None = None
 
 
 def compare(
-    data_a: EvaluationSet,
-    data_b: EvaluationSet,
-    sequence: Shaped[np.ndarray, " F"],
+    run_a: Run,
+    run_b: Run,
+    frames: Columns,
+    options: EvaluationOptions,
     *,
-    protocol_names: Sequence[str] = (protocols.RECOMMENDED, "kradar_r40"),
     spaces: Sequence[str] = SPACES,
-    iou: float = 0.3,
-    score_threshold: float = 0.0,
-    resamples: int = 2000,
 ) -> list[Comparison]:
     """Compares two runs on the same resampled sequences (paired comparison).
 
+    The seeds are paired too if both runs have the same ones.
+
     Args:
-        data_a: Evaluation set of run A.
-        data_b: Evaluation set of run B with the same ground truth and frames.
-        sequence: Sequence of every frame.
-        protocol_names: Protocols of the compared APs.
+        run_a: Evaluation sets of run A.
+        run_b: Evaluation sets of run B with the same ground truth and frames.
+        frames: Frame table with the column sequence.
+        options: Settings of the evaluation. The first two main protocols are compared
+            over all frames, and `all_point` by weather and distance, at the first IoU
+            threshold.
         spaces: "bev", "3d" or both.
-        iou: IoU threshold.
-        score_threshold: Score threshold of both runs.
-        resamples: Number of resamples.
 
     Raises:
         UserError: The runs differ in classes, frames or ground truth, or there are fewer
             than two sequences.
     """
-    _check_same_truth(data_a, data_b)
-    weights = sequence_weights(sequence, resamples=resamples, seed=0)
-    # The first row counts every frame once, which gives the APs over all frames.
-    weights = np.concatenate([np.ones_like(weights[:1]), weights])
-    rows = []
-    for protocol, space in itertools.product(protocol_names, spaces):
-        metric = protocol, space, iou
-        samples_a, samples_b = (
-            resample(data, weights, *metric, score_threshold=score_threshold)
-            for data in (data_a, data_b)
-        )
-        for index, cls in enumerate((*data_a.classes, "mean")):
-            if not np.isnan(samples_a[0, index]):
-                values = _difference(samples_a[:, index], samples_b[:, index])
-                rows.append(Comparison(cls, space, iou, protocol, *values))
-    adjusted = _holm(np.array([row.p_value for row in rows])).tolist()
-    return [
-        dataclasses.replace(row, p_adjusted=p, is_significant=p < 1 - LEVEL)
-        for row, p in zip(rows, adjusted, strict=True)
-    ]
+    sets = [*run_a.values(), *run_b.values()]
+    for other in sets[1:]:
+        _check_same_truth(sets[0], other)
+    iou, sequence = options.iou_thresholds[0], np.asarray(frames["sequence"])
+    parts = [("all", "all", sets, sequence)]
+    for name, mask in condition_masks(frames, "weather").items():
+        chosen = [data.of_frames(mask) for data in sets]
+        parts.append(("weather", name, chosen, sequence[mask]))
+    bands = [distance_sets(data, iou) for data in sets]
+    for name in bands[0]:
+        parts.append(("distance", name, [band[name] for band in bands], sequence))
+    classes, is_paired, rows = sets[0].classes, [*run_a] == [*run_b], []
+    for kind, condition, chosen, of_frame in parts:
+        names = options.main_protocols[:2] if kind == "all" else [protocols.RECOMMENDED]
+        # The first row counts every frame once, which gives the APs over all frames.
+        weights = np.ones((1, of_frame.size), np.int16)
+        if kind == "all" or np.unique(of_frame).size > 1:
+            drawn = sequence_weights(of_frame, resamples=options.bootstrap, seed=0)
+            weights = np.concatenate([weights, drawn])
+        for protocol, space in itertools.product(names, spaces):
+            metric, terms = (protocol, space, iou), options.settings_of(protocol)
+            aps = np.stack([resample(x, weights, *metric, **terms) for x in chosen])
+            shown = space, iou, protocol, terms["score_threshold"]
+            # With a single class, the mean would be the same row again.
+            for index, cls in enumerate((*classes, "mean")[: len(classes) ** 2]):
+                a, b = np.split(aps[..., index], [len(run_a)])
+                if not np.isnan(a[0, 0]):
+                    values = _difference(a, b, is_paired, np.unique(of_frame).size)
+                    rows.append(Comparison(kind, condition, cls, *shown, *values))
+    is_tested = min(len(run_a), len(run_b)) >= MIN_SEEDS
+    adjusted, least = list[Comparison](), 0.0
+    for _, of_kind in itertools.groupby(rows, lambda row: row.kind):
+        group = list(of_kind)
+        found = np.maximum(_holm([row.p_value for row in group]), least).tolist()
+        least = least or min(found)  # of all frames, which are the first group
+        for row, p in zip(group, found, strict=True):
+            verdict = p < 1 - LEVEL if is_tested else None
+            row = dataclasses.replace(row, p_adjusted=p, is_significant=verdict)
+            adjusted.append(row)
+    return adjusted
 
 
-def _difference(
-    samples_a: Float[np.ndarray, " B"], samples_b: Float[np.ndarray, " B"]
-) -> tuple[float, float, float, float, float, float]:
-    """Returns both APs, their difference, its interval and its p-value.
+def _difference(a: Aps, b: Aps, is_paired: bool, num_sequences: int) -> tuple[Any, ...]:
+    """Returns both APs, their difference, its deviation, interval and p-value.
 
-    The first sample of each run is its AP over all frames; the others are resamples.
+    Args:
+        a: `[N, 1+B]` APs of the seeds of run A. The first column is over all frames, the others are
+            over resamples of sequences.
+        b: `[M, 1+B]` APs of run B in the same way.
+        is_paired: Whether row i of both runs has the same seed.
+        num_sequences: Number of sequences.
     """
-    ap_a, ap_b = float(samples_a[0]), float(samples_b[0])
-    gaps = samples_b[1:] - samples_a[1:]
-    gaps = gaps[~np.isnan(gaps)]
-    # One is added so that no finite number of resamples gives a p-value of 0.
-    turned = min((gaps <= 0).sum(), (gaps >= 0).sum()) + 1
-    p_value = float(min(1.0, 2 * turned / (gaps.size + 1)))
-    return ap_a, ap_b, ap_b - ap_a, *interval(gaps), p_value
+    gaps = b.mean(axis=0) - a.mean(axis=0)
+    aps = float(a[:, 0].mean()), float(b[:, 0].mean()), float(gaps[0])
+    gaps, count = gaps[1:][~np.isnan(gaps[1:])], min(len(a), len(b))
+    if count < MIN_SEEDS or not gaps.size:
+        # One is added so that no finite number of resamples gives a p-value of 0.
+        turned = min((gaps <= 0).sum(), (gaps >= 0).sum()) + 1
+        p_value = float(min(1.0, 2 * turned / (gaps.size + 1)))
+        return *aps, float("nan"), *interval(gaps), p_value
+    if is_paired:
+        of_seeds = (b - a)[:, 0].var(ddof=1) / count
+    else:
+        of_seeds = sum(x[:, 0].var(ddof=1) / len(x) for x in (a, b))
+    of_sequences = gaps.var() * num_sequences / (num_sequences - 1)
+    error = max(np.sqrt(of_seeds + of_sequences), 1e-9)  # 0 for identical runs
+    share = of_seeds / error**2
+    # Descending p-values, and the quotients of difference and error that give them.
+    p_values = np.geomspace(1, 1e-9, 2000)
+    quotients = share * stdtrit(count - 1, 1 - p_values / 2)
+    quotients += (1 - share) * stdtrit(num_sequences - 1, 1 - p_values / 2)
+    half = error * np.interp(1 - LEVEL, p_values[::-1], quotients[::-1])
+    p_value = np.interp(abs(aps[2]) / error, quotients, p_values)
+    values = np.sqrt(count * of_seeds), aps[2] - half, aps[2] + half, p_value
+    return *aps, *map(float, values)
 
 
-def _holm(p_values: Float[np.ndarray, " R"]) -> Float[np.ndarray, " R"]:
+def _holm(p_values: Sequence[float]) -> list[float]:
     """Adjusts p-values for their number with Holm's step-down method."""
     order = np.argsort(p_values, kind="stable")
-    scaled = np.minimum(1, np.arange(p_values.size, 0, -1) * p_values[order])
+    counts = np.arange(len(p_values), 0, -1)
+    scaled = np.minimum(1, counts * np.asarray(p_values)[order])
     adjusted = np.empty_like(scaled)
     adjusted[order] = np.maximum.accumulate(scaled)
-    return adjusted
+    return adjusted.tolist()
 
 
 def _check_same_truth(data_a: EvaluationSet, data_b: EvaluationSet) -> None:
@@ -150,25 +219,48 @@ def _check_same_truth(data_a: EvaluationSet, data_b: EvaluationSet) -> None:
     ):
         if not np.array_equal(one, other):
             counts = f"{len(one)} and {len(other)}"
-            raise UserError(
-                f"the runs have different {name} ({counts}), expected equal"
+            raise UserError(f"the runs have different {name} ({counts})")
+
+
+def comparison_tables(
+    rows: Sequence[Comparison], run_a: str, run_b: str, seeds: Iterable[int] = ()
+) -> list[report.Table]:
+    """Returns the tables of differences over all frames, by weather and by distance.
+
+    Args:
+        rows: Result of `compare`.
+        run_a: Name of run A.
+        run_b: Name of run B.
+        seeds: Numbers of seeds of both runs.
+    """
+    is_tested = rows[0].is_significant is not None
+    note = "over sequences; the variation between trainings is not counted"
+    if is_tested:
+        counts = " and ".join(map(str, dict.fromkeys(seeds)))
+        note = f"over seeds and sequences, gain ± standard deviation of {counts} seeds"
+    note = f"p after Holm, 95 % intervals {note}"
+    header = ["Class", "Protocol", "AP", "A", "B", "B - A", "95 %", "p"]
+    header += ["Difference"] * is_tested
+    built = []
+    for kind, group in itertools.groupby(rows, lambda row: row.kind):
+        body = []
+        for row in group:
+            protocol = f"{row.protocol}, score>{row.score_threshold:g}"
+            metric = f"{row.space.upper()} {row.iou:g}"
+            gap, low, high = report.numbers(
+                (row.difference, row.low, row.high), signed=True
             )
-
-
-def comparison_table(rows: Sequence[Comparison], run_a: str, run_b: str) -> Table:
-    """Returns the table of the differences of two runs and their significance."""
-    header = ["Class", "Protocol", "AP", "IoU", "A", "B", "B - A", "95 %", "p"]
-    body = []
-    for row in rows:
-        gap, low, high = numbers((row.difference, row.low, row.high), signed=True)
-        entries = [row.cls, row.protocol, row.space.upper(), f"{row.iou:g}"]
-        entries += [*numbers((row.ap_a, row.ap_b)), gap, f"[{low}, {high}]"]
-        verdict = "significant" if row.is_significant else "not significant"
-        body.append([*entries, f"{row.p_adjusted:.3f}", verdict])
-    title = (
-        f"B = {run_b} against A = {run_a}: 95 % intervals over sequences, p after Holm"
-    )
-    return Table(title, [*header, "Difference"], body)
+            verdict = []
+            if is_tested:
+                gap += f" ± {report.number(row.std)}"
+                verdict = ["significant" if row.is_significant else "not significant"]
+            aps = report.numbers((row.ap_a, row.ap_b))
+            values = [*aps, gap, f"[{low}, {high}]", f"{row.p_adjusted:.3f}", *verdict]
+            body.append([row.condition, row.cls, protocol, metric, *values])
+        by = "all frames" if kind == "all" else f"by {kind}"
+        title = f"B = {run_b} against A = {run_a}, {by}: {note}"
+        built.append(report.Table(title, [kind.capitalize(), *header], body))
+    return built
 
 
 def compare_files(
@@ -180,12 +272,11 @@ def compare_files(
     """Compares each run with the first one on the same frames.
 
     Args:
-        paths: Predictions or report folders of at least two runs. The first is run A.
-        out_dir: Folder for comparison.txt and comparison.json, or None.
+        paths: At least two runs: folders of runs, folders with the seeds of a run, folders
+            of reports, or predictions. The first is run A.
+        out_dir: Folder for comparison.txt, .md, .tex and .json, or None.
         source: Source of the ground truth for paths that do not contain it.
-        options: Classes, protocols, IoU thresholds, region, score threshold and number
-            of resamples of sequences (`bootstrap`). The first two main protocols and the
-            first IoU threshold are compared.
+        options: Settings of the evaluation, see `compare`.
 
     Returns:
         The tables as text, and the fields of all comparisons in the order of the runs.
@@ -198,42 +289,41 @@ def compare_files(
         raise UserError("a comparison needs at least two runs")
     if options.bootstrap < 1:
         raise UserError("--bootstrap=0: a comparison needs 1 resample or more")
+    folders = [report_folders(path) for path in paths]
     # Predictions below the lowest stored score of one run must not count for another run.
-    threshold = max(options.score_threshold, *map(stored_from, paths))
-    options = dataclasses.replace(
-        options, score_threshold=threshold, min_score=threshold
+    stored = (
+        stored_options(x).get("min_score", 0) for y in folders for x in y.values()
     )
+    options = dataclasses.replace(options, min_score=max(options.min_score, *stored))
     names = [str(path) for path in paths]
-    (first, sequence), *others = [_load_run(path, source, options) for path in paths]
+    (first, frames), *others = [_load_run(run, source, options) for run in folders]
     built, rows = [], []
-    for name, (data, _) in zip(names[1:], others, strict=True):
-        found = compare(
-            first,
-            data,
-            sequence,
-            protocol_names=options.main_protocols[:2],
-            iou=options.iou_thresholds[0],
-            score_threshold=threshold,
-            resamples=options.bootstrap,
-        )
-        built.append(comparison_table(found, names[0], name))
-        rows += [plain(dataclasses.asdict(row)) for row in found]
-    text = rendered(built, is_simulated=first.is_simulated)
+    for name, (sets, _) in zip(names[1:], others, strict=True):
+        found = compare(first, sets, frames, options)
+        built += comparison_tables(found, names[0], name, (len(first), len(sets)))
+        rows += [report.plain(dataclasses.asdict(row)) for row in found]
+    is_simulated = next(iter(first.values())).is_simulated
+    text = report.rendered(built, is_simulated=is_simulated)
     if out_dir is not None:
         content = {"runs": names, "options": dataclasses.asdict(options), "rows": rows}
-        files.write_text(pathlib.Path(out_dir) / "comparison.txt", text)
-        files.write_json(pathlib.Path(out_dir) / "comparison.json", content)
+        place = pathlib.Path(out_dir) / "comparison"
+        files.write_text(place.with_suffix(".txt"), text)
+        files.write_json(place.with_suffix(".json"), content)
+        report.write_tables(place, built, is_simulated=is_simulated)
     return text, rows
 
 
 def _load_run(
-    path: PathLike, source: Source, options: EvaluationOptions
-) -> tuple[EvaluationSet, np.ndarray]:
-    """Returns the evaluation set of a run and the sequence of each of its frames."""
-    truth, found, frames, _ = load(path, source, options.classes)
-    if "sequence" not in frames:
-        raise UserError(
-            f"{path}: a comparison resamples sequences, and the frame table has no column "
-            "sequence: give --data or --labels"
-        )
-    return make_set(truth, found, frames, options), np.asarray(frames["sequence"])
+    folders: Mapping[str, pathlib.Path], source: Source, options: EvaluationOptions
+) -> tuple[dict[str, EvaluationSet], Columns]:
+    """Returns the evaluation sets of the seeds of a run, and its frame table."""
+    sets: dict[str, EvaluationSet] = {}
+    for name, path in folders.items():
+        truth, found, frames, _ = load(path, source, options.classes)
+        if "sequence" not in frames:
+            raise UserError(
+                f"{path}: a comparison resamples sequences, and the frame table has no "
+                "column sequence: give --data or --labels"
+            )
+        sets[name] = make_set(truth, found, frames, options)
+    return sets, frames

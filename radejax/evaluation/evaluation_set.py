@@ -27,6 +27,9 @@ MAX_PAIRS = 1_000_000
 
 A frame rarely has more than 100 predictions and 20 objects of a class."""
 
+Rows = Bool[np.ndarray, " _"] | slice
+ALL = slice(None)
+
 Matches = matching.KradarMatches | Int[np.ndarray, " M"]
 
 
@@ -140,7 +143,7 @@ class EvaluationSet:
         self.is_simulated = bool(np.any(frames.get("simulated", False)))
         self._roi = roi
         self.left_out: dict[str, int] = {}
-        self.gt, _ = self._select(truth, "ground truth")
+        self.gt, self._gt_row = self._select(truth, "ground truth")
         self.pred, self._pred_row = self._select(found, "predictions")
         assert self.pred.score is not None  # read_boxes requires it
         self.score = self.pred.score
@@ -185,14 +188,25 @@ class EvaluationSet:
         shape = self.frame.size, len(self.classes)
         return np.bincount(group, minlength=shape[0] * shape[1]).reshape(shape)
 
+    def evaluated(self, gt: Rows = ALL, pred: Rows = ALL) -> tuple[Boxes, Boxes]:
+        """Returns rows of `gt` and `pred` as they were given, in the order of the input."""
+        truth, found = np.sort(self._gt_row[gt]), np.sort(self._pred_row[pred])
+        return self.ground_truth.take(truth), self.predictions.take(found)
+
     def of_frames(self, is_chosen: Bool[np.ndarray, " F"]) -> EvaluationSet:
         """Returns the evaluation set of some frames, such as those of one condition."""
-        ids = self.frame[is_chosen]
-        tables = self.ground_truth, self.predictions
+        chosen = is_chosen[self.gt.frame], is_chosen[self.pred.frame]
+        return self.of_boxes(*chosen, self.frame[is_chosen])
+
+    def of_boxes(self, gt: Rows, pred: Rows, frame: np.ndarray) -> EvaluationSet:
+        """Returns the evaluation set of rows of `gt` and `pred` in the frames of these ids."""
         return EvaluationSet(
-            *(table.take(np.isin(table.frame, ids)) for table in tables),
+            *self.evaluated(gt, pred),
             classes=self.classes,
-            frames={"frame": ids, "simulated": np.full(ids.size, self.is_simulated)},
+            frames={
+                "frame": frame,
+                "simulated": np.full(frame.size, self.is_simulated),
+            },
             roi=self._roi,
             label_version=self.label_version,
         )

@@ -235,12 +235,30 @@ def _load_ground_truth(
     )
 
 
-def stored_from(path: PathLike) -> float:
-    """Returns the minimum score of stored predictions in their report, or 0 without one."""
-    path = files.as_path(path)
-    if not (path / "metrics.json").is_file():
-        return 0.0
-    return float(files.read_json(path / "metrics.json")["options"]["min_score"])
+def report_folders(path: PathLike) -> dict[str, pathlib.Path]:
+    """Returns the folders of the reports of a run by the names of its seeds.
+
+    For a folder of `radejax train --seeds`, they are those of the seeds that have one. For
+    another path, it is the report of the run or the path itself, named "".
+    """
+    path, end = files.as_path(path), "evaluation/predictions.npz"
+    found = {file.parts[-3]: file.parent for file in sorted(path.glob(f"seed*/{end}"))}
+    return found or {"": path / "evaluation" if (path / end).is_file() else path}
+
+
+def stored_options(path: PathLike) -> dict[str, Any]:
+    """Returns the options of the first report of a run.
+
+    Without a report, they are the classes of the config in the folder or its parent, or
+    none without a config.
+    """
+    place, found = next(iter(report_folders(path).values())), dict[str, Any]()
+    for config in (place.parent / "config.json", place / "config.json"):
+        if config.is_file():
+            found = {"classes": files.read_object(config, "classes")["classes"]}
+    if (place / "metrics.json").is_file():
+        found = files.read_object(place / "metrics.json", "options")["options"]
+    return {name: tuple(x) if isinstance(x, list) else x for name, x in found.items()}
 
 
 def _read_frames(path: PathLike) -> Columns:
@@ -268,8 +286,11 @@ def evaluate_files(
     run: str = "radejax",
 ) -> Report:
     """Evaluates predictions in files and writes the report; see `load` for errors."""
+    path, *others = report_folders(path).values()
+    if others:
+        raise UserError(f"{path.parents[1]} holds several seeds: name one of them")
     truth, found, frames, left_out = load(path, source, options.classes)
-    warnings, low = [], stored_from(path)
+    warnings, low = [], stored_options(path).get("min_score", 0.0)
     if low > max(LOW_SCORE, options.score_threshold):
         warnings.append(
             f"{path} has only predictions from score {low:g} on, and every number is of "

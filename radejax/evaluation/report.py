@@ -1,11 +1,13 @@
 """The report of an evaluation: console text, JSON, CSV, Markdown, LaTeX and figures.
 
-`published.csv` contains the result tables of the RADE-Net and DinoRADE papers, with one
-line per class, space and IoU threshold of a printed row, in the order of the papers. The
-values are average precisions in percent, "-" if the paper prints "-", and empty if its
-table has no such column. Values of 0.99 (1/101, the lower bound of the protocol) are kept
-as printed. A difference to a published row is printed only if protocol, labels, region
-and split agree. Results of simulated frames are not printed next to published rows.
+`published.csv` contains the result tables of the RADE-Net and DinoRADE papers, in their
+order, and then other methods as their own repositories, logs or abstracts print them, with
+one line per class, space and IoU threshold of a printed row. The values are average
+precisions in percent, "-" if the source prints "-", and empty if it has no such column.
+Values of 0.99 (1/101, the lower bound of the protocol) are kept as printed; logs are
+rounded to two decimals. A difference to a published row is printed only if protocol, score
+threshold, labels, region and split agree. Results of simulated frames are not printed next
+to published rows.
 
 References:
     RADE-Net: Leitgeb et al., "RADE-Net: Robust Attention Network for Radar-Only Object
@@ -21,11 +23,12 @@ import functools
 import importlib.resources
 import itertools
 import pathlib
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from tabulate import tabulate
+from tabulate import LATEX_ESCAPE_RULES, tabulate
 
 from radejax.core import files
 from radejax.core.files import PathLike
@@ -33,6 +36,7 @@ from radejax.data.kradar.conditions import WEATHERS
 from radejax.evaluation import analysis, protocols
 from radejax.evaluation.boxes import Columns, roi_name, write_boxes
 from radejax.evaluation.evaluation_set import EvaluationSet, Result
+from radejax.evaluation.kitti import write_kitti
 from radejax.evaluation.results import (
     EvaluationOptions,
     condition_masks,
@@ -95,7 +99,8 @@ def write_report(
         options = dataclasses.replace(options, protocols=names)
     data, results = evaluate_tables(ground_truth, predictions, frames, options)
     iou = options.iou_thresholds[0]
-    settings = f"3d, IoU {iou:g}, score > {analysis.OPERATING_SCORE:g}"
+    settings = f"3d, IoU {iou:g}, score>{options.min_score:g}; precision and recall "
+    settings += f"at score>{analysis.OPERATING_SCORE:g}"
     metrics = {
         "run": run,
         "options": dataclasses.asdict(options),
@@ -127,9 +132,10 @@ def write_report(
         files.write_json(folder / "metrics.json", metrics)
         files.write_json(folder / "frames.json", columns)
         files.write_text(folder / "report.txt", text)
-        for name, style in (("tables.md", "markdown"), ("tables.tex", "latex")):
-            content = rendered(built, style, is_simulated=data.is_simulated)
-            files.write_text(folder / name, content)
+        write_tables(folder / "tables", built, is_simulated=data.is_simulated)
+        for table in built:
+            latex = table.render("latex", is_simulated=data.is_simulated)
+            files.write_text(folder / "tables" / f"{table.label}.tex", latex)
         with open(folder / "metrics.csv", "w", encoding="utf-8", newline="") as file:
             writer = csv.DictWriter(file, list(metrics["ap"][0]), lineterminator="\n")
             writer.writeheader()
@@ -137,6 +143,10 @@ def write_report(
         # The stored predictions have repaired sizes, so that they can be evaluated again.
         write_boxes(folder / "predictions.npz", data.predictions, frames)
         write_boxes(folder / "ground_truth.npz", data.ground_truth, frames)
+        if options.kitti:
+            truth, found = map(vars, data.evaluated())
+            least = options.settings_of("kradar_r40")["score_threshold"]
+            write_kitti(folder / "kitti", truth, found, frames, score_threshold=least)
         if options.plots:
             _draw_curves(data, frames, options, folder)
         if draw_frame is not None:
@@ -145,7 +155,8 @@ def write_report(
                 name = f"frame_{entry['frame']}"
                 if {"name", "sequence"} <= set(entry):  # as in other figures
                     name = f"{entry['sequence']:02d}_{entry['name']}"
-                draw_frame(entry["frame"], folder / "worst_frames" / f"{name}.png")
+                path = folder / "worst_frames" / f"{name}.{options.figures}"
+                draw_frame(entry["frame"], path)
     return Report(text, metrics, results, pathlib.Path(out_dir))
 
 
@@ -231,8 +242,8 @@ def _draw_curves(
                 panels.setdefault(title, {})[label] = curve
         seen = {title: lines for title, lines in panels.items() if any(lines.values())}
         figure = draw_precision_recall(seen or dict([*panels.items()][:1]))
-        path = folder / f"precision_recall_{space}_iou{100 * iou:.4g}.png"
-        save_figure(figure, path)
+        name = f"precision_recall_{space}_iou{100 * iou:.4g}.{options.figures}"
+        save_figure(figure, folder / name)
 
 
 def plain(value: Any) -> Any:
@@ -272,15 +283,22 @@ class Table:
     header: Sequence[str]
     rows: Sequence[Sequence[str | int]]
 
+    @property
+    def label(self) -> str:
+        """Label in LaTeX and name of the file of the table."""
+        return re.sub("[^a-z0-9]+", "-", self.title.lower()).strip("-")
+
     def render(self, style: str = "text", *, is_simulated: bool = False) -> str:
-        """Renders the table as "text", "markdown" or "latex" (with the title as comment)."""
+        """Renders the table as "text", "markdown" or "latex" (with caption and label)."""
         align = ["left", *["right"] * (len(self.header) - 1)]
         body = tabulate(
             self.rows, self.header, STYLES[style], disable_numparse=True, colalign=align
         )
         title = f"Simulated data: {self.title}" if is_simulated else self.title
         if style == "latex":
-            return f"% {title}\n{body}\n"
+            caption = "".join(LATEX_ESCAPE_RULES.get(x, x) for x in title)
+            head = f"\\caption{{{caption}}}\n\\label{{tab:{self.label}}}\n"
+            return f"\\begin{{table}}\n{head}{body}\n\\end{{table}}\n"
         title = f"**{title}**" if style == "markdown" else title
         return f"{title}\n\n{body}\n"
 
@@ -290,6 +308,12 @@ def rendered(
 ) -> str:
     """Renders several tables below each other."""
     return "\n".join(table.render(style, is_simulated=is_simulated) for table in tables)
+
+
+def write_tables(path: pathlib.Path, tables: Sequence[Table], **options: Any) -> None:
+    """Writes tables as Markdown and LaTeX to files with these suffixes, see `rendered`."""
+    for suffix, style in ((".md", "markdown"), (".tex", "latex")):
+        files.write_text(path.with_suffix(suffix), rendered(tables, style, **options))
 
 
 def number(value: float | None, *, signed: bool = False, digits: int = 2) -> str:
@@ -346,7 +370,8 @@ def by_protocol(
     body = []
     for name in options.protocols:
         found = (results[name, "all", cls, space, iou] for cls in classes)
-        body.append([name, *map(_with_interval, found)])
+        terms = f"{name}, score>{options.settings_of(name)['score_threshold']:g}"
+        body.append([terms, *map(_with_interval, found)])
     title = f"AP {space.upper()} at IoU {iou:g} in every protocol, all weathers"
     if any(result.low is not None for result in results.values()):
         title += f", 95 % intervals of {options.bootstrap} resamples of sequences"
@@ -420,22 +445,46 @@ class PublishedRow:
     """One row of a published table.
 
     Attributes:
-        source: Paper and table, such as "DinoRADE, Table 2".
+        source: Paper and table, such as "DinoRADE, Table 2", or repository and file.
         method: Name of the row; in ablations, the components that the row includes.
-        modality: Sensors: L for LiDAR, C for camera, R for radar.
+        sensors: L for LiDAR, C for camera, R for radar.
         label_version: K-Radar label revision.
-        protocol: Evaluation protocol as far as known.
+        label_origin: "stated" by the source, or where the revision is known from.
+        protocol: Evaluation protocol, or "not stated", as also in the next two fields.
+        score_threshold: Predictions with a higher score were evaluated.
+        region: Region of interest, "narrow" or "wide".
+        code: Repository of the method, "none", or "not stated".
+        config: Config that trains the method, or "not trainable here".
         note: Remark on the row.
-        values: APs as printed. The class "mean" is the mAP of the paper.
+        values: APs as printed. The class "mean" is the mAP of the source.
     """
 
     source: str
     method: str
-    modality: str
+    sensors: str
     label_version: str
+    label_origin: str
     protocol: str
+    score_threshold: str
+    region: str
+    code: str
+    config: str
     note: str
     values: dict[Cell, str]
+
+    @property
+    def terms(self) -> str:
+        """Protocol, and what is known of score threshold, labels and region."""
+        origin = "" if self.label_origin == "stated" else f" ({self.label_origin})"
+        terms = (
+            self.protocol.replace("not stated", "protocol not stated"),
+            f"score>{self.score_threshold}",
+            f"labels={self.label_version}{origin}",
+            f"roi={self.region}",
+        )
+        return ", ".join(
+            term for term in terms if not re.search("[>=]not stated", term)
+        )
 
     def differences(
         self,
@@ -450,8 +499,10 @@ class PublishedRow:
         """
         is_comparable = (
             options.paper_protocol == self.protocol
+            and options.settings_of(self.protocol)["score_threshold"]
+            == float(self.score_threshold)
             and options.label_version == self.label_version
-            and roi_name(options.roi) == "narrow"
+            and roi_name(options.roi) == self.region
             and split == "test"
             and self.source not in _ABLATIONS
         )
@@ -471,7 +522,6 @@ def _read() -> tuple[PublishedRow, ...]:
     text = importlib.resources.files(__package__) / "published.csv"
     rows: dict[tuple[str, ...], PublishedRow] = {}
     for line in csv.DictReader(text.read_text(encoding="utf-8").splitlines()):
-        line["source"] = f"{line['paper']}, Table {line['table']}"
         fields = {name: line[name] for name in names}
         row = rows.setdefault(tuple(fields.values()), PublishedRow(**fields, values={}))
         for condition in filter(line.get, CONDITIONS):
@@ -481,7 +531,7 @@ def _read() -> tuple[PublishedRow, ...]:
 
 
 PUBLISHED = _read()
-"""All rows of all result tables of both papers."""
+"""All rows of all result tables of both papers, and of other sources."""
 
 
 # A run in the layouts of the papers ---------------------------------------------------
@@ -534,7 +584,17 @@ def paper_tables(
         [{"cls": "Sedan"}],
         _crossed([{"iou": 0.3}, {"iou": 0.5}], _BOTH),
     )
-    return [by_weather, *built, ablations]
+    others = layout(
+        "Other methods, all weathers, as printed elsewhere",
+        [row.source for row in PUBLISHED if ", Table" not in row.source],
+        [
+            group
+            for group in classes
+            if group["cls"] in ("Sedan", "Bus or Truck", "mean")
+        ],
+        _crossed([{"iou": 0.3}, {"iou": 0.5}], _BOTH),
+    )
+    return [by_weather, *built, ablations, others]
 
 
 def _crossed(outer: Sequence[Place], inner: Sequence[Place]) -> list[Place]:
@@ -576,12 +636,11 @@ def _layout(
             if row.source not in sources or set(values) == {"-"} or is_repeated:
                 continue
             printed.append([row.method, *values])
-            terms = f"{row.protocol}, labels={row.label_version}"
-            name = f"{row.method} ({row.modality})"
-            body.append([name, of, row.source, terms, *values])
+            name = f"{row.method} ({row.sensors})"
+            body.append([name, of, row.source, row.terms, *values])
             gaps = row.differences(cells, compared, options, split)
             if set(gaps) != {"-"}:
-                same = "same protocol, labels, region, split"
+                same = "same protocol, score, labels, region, split"
                 body.append(["difference", of, row.source, same, *gaps])
         for protocol in options.main_protocols:
             aps = [ap_of(results, protocol, *cell) for cell in cells]

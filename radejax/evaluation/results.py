@@ -70,6 +70,8 @@ class EvaluationOptions:
         plots: Whether to draw curves.
         batch_size: Number of frames per batch of predictions.
         num_visualizations: Number of frames to draw.
+        figures: Format of the figures, "png" or "pdf".
+        kitti: Whether to write the boxes as text files for K-Radar's evaluation script.
     """
 
     classes: tuple[str, ...] = CLASSES
@@ -85,6 +87,8 @@ class EvaluationOptions:
     plots: bool = True
     batch_size: int = 8
     num_visualizations: int = 8
+    figures: str = "png"
+    kitti: bool = False
 
     def __post_init__(self) -> None:
         check_options(vars(self), "config.evaluation", _RANGES)

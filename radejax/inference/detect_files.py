@@ -13,7 +13,7 @@ import itertools
 import json
 import os
 import pathlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ from radejax.data.dataset import data_set
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.conditions import check_weather, read_description
 from radejax.data.kradar.dataset import sequence_number
-from radejax.data.pipeline import camera_inputs
+from radejax.data.pipeline import camera_inputs, frame_histories
 from radejax.evaluation import kitti
 from radejax.geometry.camera import Camera
 from radejax.inference.detector import Detector
@@ -175,8 +175,9 @@ def detect_files(
 
     Returns:
         The numbers of "frames", of "boxes" and of "clipped" boxes, whose size was clipped.
-        For a radar-camera model, "radar_only" is the number of frames without a label
-        file, image or calibration.
+        For a model of several frames, "repeated" is the number of frames that repeat
+        themselves, as there is no preceding one. For a radar-camera model, "radar_only" is
+        the number of frames without a label file, image or calibration.
 
     Raises:
         FileNotFoundError: A path does not exist.
@@ -191,7 +192,7 @@ def detect_files(
     detector = Detector.from_workdir(source, step, image_backbone=image_backbone)
     is_kradar = detector.saved.config.data.format == "kradar"
     read, part = _files if is_kradar else _frames, (sequence_numbers, weather)
-    keys, inputs = read(paths, *part, detector, labels, batch_size)
+    keys, inputs = read(paths, *part, detector, labels)
     out = files.as_path(out)
     out.mkdir(parents=True, exist_ok=True)
     names = [f"{key.replace('/', '_')}.json" for key in keys]
@@ -199,12 +200,13 @@ def detect_files(
         names = [f"preds/{number:06d}.txt" for number in range(len(keys))]
         table = {"frame": list(range(len(keys))), "name": keys}
         files.write_json(out / "frames.json", table)
-    batches = _batches(keys, batch_size)
+    batches = _batches(keys, detector.num_frames, batch_size)
     is_table, rows = file_format in ("csv", "parquet"), list[dict[str, Any]]()
-    found = detector.stream(inputs, **settings)
+    streams = (detector.stream(map(inputs, part), **settings) for part in batches)
+    found = itertools.chain.from_iterable(streams)
     count = {"frames": len(keys), "boxes": 0, "clipped": 0}
     with tqdm.tqdm(total=len(keys), desc="detect", unit="frame") as bar:
-        for batch, detections in zip(batches, found, strict=True):
+        for batch, detections in zip(itertools.chain(*batches), found, strict=True):
             if is_table:
                 rows += itertools.chain(*_records(keys[batch], detections))
             else:
@@ -216,13 +218,29 @@ def detect_files(
             bar.update(len(keys[batch]))
     if is_table:
         _write_table(out / f"boxes.{file_format}", rows)
+    if detector.num_frames > 1:
+        count["repeated"] = len(batches)
     if detector.takes_camera:
         count["radar_only"] = detector.num_radar_only
     return count
 
 
-def _batches(items: Sequence[Any], batch_size: int) -> list[slice]:
-    return [slice(i, i + batch_size) for i in range(0, len(items), batch_size)]
+def _batches(
+    keys: Sequence[str], num_frames: int, batch_size: int
+) -> list[list[slice]]:
+    """Return the batches of every part of consecutive frames, which is one stream.
+
+    All frames are one part if a sample has one frame.
+    """
+    starts = [0]
+    if num_frames > 1:
+        before = {key: sample[0] for key, sample in frame_histories(keys, 2).items()}
+        pairs = itertools.pairwise(keys)
+        starts += [i for i, (a, b) in enumerate(pairs, 1) if before[b] != a]
+    return [
+        [slice(i, min(i + batch_size, end)) for i in range(start, end, batch_size)]
+        for start, end in itertools.pairwise([*starts, len(keys)])
+    ]
 
 
 def _files(
@@ -231,9 +249,8 @@ def _files(
     weather: Sequence[str] | None,
     detector: Detector,
     labels: str | os.PathLike | None,
-    batch_size: int,
-) -> tuple[list[str], Iterable[Any]]:
-    """Return the keys of K-Radar's frames, and the inputs of the detector in batches."""
+) -> tuple[list[str], Callable[[slice], Any]]:
+    """Return the keys of K-Radar's frames, and a function that reads a batch of inputs."""
     frames = find_frames(paths, sequence_numbers, weather)
     seen: dict[str, pathlib.Path] = {}
     for path in frames:
@@ -242,16 +259,17 @@ def _files(
                 f"{other} and {path} would both be written as "
                 f"{output_name(path)}.json: detect each root into a folder of its own"
             )
-    keys, batches = [key_of(path) for path in frames], _batches(frames, batch_size)
-    data = detector.saved.config.data
+    if detector.num_frames > 1:  # folders of tensors and of projections may be mixed
+        frames.sort(key=key_of)
+    keys, data = [key_of(path) for path in frames], detector.saved.config.data
     known: dict[pathlib.Path, tuple[pathlib.Path, Camera]] = {}
     if detector.takes_camera:
         labels = labels or data.labels
         known = front_images(frames, detector, labels, data.label_version)
     if not known:
-        return keys, (frames[batch] for batch in batches)
+        return keys, lambda batch: frames[batch]
     images = [known.get(path.absolute(), (None, None)) for path in frames]
-    return keys, ((frames[b], *zip(*images[b], strict=True)) for b in batches)
+    return keys, lambda batch: (frames[batch], *zip(*images[batch], strict=True))
 
 
 def _frames(
@@ -260,9 +278,8 @@ def _frames(
     weather: Sequence[str] | None,
     detector: Detector,
     labels: str | os.PathLike | None,
-    batch_size: int,
-) -> tuple[list[str], Iterable[Any]]:
-    """Return keys and inputs as `_files` does, from the reader of the run's own format."""
+) -> tuple[list[str], Callable[[slice], Any]]:
+    """Return the same as `_files` from the reader of the run's own format."""
     config = detector.saved.config
     frames = data_set(config.data.format)(
         list(map(str, roots)),
@@ -289,8 +306,7 @@ def _frames(
         radar = np.stack([f.read_projection(frames.grid) for f in frames[batch]])
         return (radar, *zip(*images[batch], strict=True)) if images else radar
 
-    batches = _batches(frames, batch_size)
-    return [frame.key for frame in frames], map(read, batches)
+    return [frame.key for frame in frames], read
 
 
 def _texts(keys: Sequence[str], detections: Detections, file_format: str) -> list[str]:

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
-from jaxtyping import Bool, Real, Shaped, UInt8
+from jaxtyping import Bool, Float, Real, Shaped, UInt8
 
 from radejax import models
 from radejax.core.errors import UserError, require
@@ -30,6 +30,7 @@ from radejax.data.projection import (
     MAX_LEVEL,
     find_problem,
     project_jax,
+    stack_frames,
     to_log_scale,
 )
 from radejax.data.tesseract import read_frame
@@ -57,6 +58,7 @@ Calibration = CameraCalibration | PathLike
 Calibrations = Camera | Calibration | Sequence[Camera | Calibration | None]
 
 _PATH = (str, os.PathLike)
+_project = jax.jit(project_jax)
 _KRADAR_FROM_LIDAR_M = (*RADAR_FROM_LIDAR_M[:2], KRADAR_RADAR_FROM_LIDAR_Z_M)
 
 
@@ -115,6 +117,8 @@ class Detector:
             rounded up to a multiple of the process's devices.
 
     Attributes:
+        num_frames: Number of frames of a sample, `config.data.num_frames`. Above 1, calls
+            take samples, and `stream` single frames.
         num_radar_only: Number of frames so far that a radar-camera model predicted
             without an image and its calibration. Frames in a `Batch` are not counted.
         num_invalid_frames: Number of frames so far, passed as NumPy arrays, with values
@@ -145,6 +149,7 @@ class Detector:
         self.saved = dataclasses.replace(saved, config=config)
         self.grid = saved.grid
         self.model: Any = self.saved.model
+        self.num_frames: int = self.model.num_frames
         self.takes_camera = models.has_camera(self.model)
         self.camera_options = CameraOptions.from_config(config.data)
         self.classes = tuple(config.classes)
@@ -251,7 +256,8 @@ class Detector:
             frames: Projections `[B, R, A, D+E]` or tesseracts `[B, D, R, E, A]` in
                 linear power, a single frame without the axis B, the path of a file, or a
                 list of arrays and paths. Alternatively a `Batch`, whose image and camera
-                are used.
+                are used. A model of several frames takes consecutive frames, oldest first,
+                on an axis of length `num_frames` after B; a list is one sample.
             image: Images for a radar-camera model: `[B, H, W, 3]` uint8, embedded images,
                 or a list of arrays, paths and None.
             camera: One calibration for all frames, or a list with one per frame.
@@ -270,14 +276,17 @@ class Detector:
         if isinstance(frames, Batch):  # its content was checked when it was created
             inputs = frames.projection, frames.image, frames.camera
         else:
-            radar = radar_batch(frames, self.grid)
+            radar = self._read(frames, self.num_frames)
+            if self.num_frames > 1:
+                shape = (-1, self.num_frames, *self.grid.projection_shape)
+                projections = _projections(radar, self.grid).reshape(shape)
+                samples = np.moveaxis(projections, 1, 0)
+                radar = stack_frames(list(samples), self.grid.num_doppler)
             image, camera, num_radar_only = camera_batch(
                 image, camera, len(radar), self.model, self.camera_options
             )
             inputs = radar, image, camera
-            num_invalid = count_invalid(radar, warn=not self.num_invalid_frames)
             with self._lock:
-                self.num_invalid_frames += num_invalid
                 self.num_radar_only += num_radar_only
         check_backbone(inputs[1], self.variables)
         options = {**self.decode_options, **_settings(score_threshold, nms_iou, roi)}
@@ -291,6 +300,14 @@ class Detector:
         if len(parts) == 1:
             return parts[0]
         return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+
+    def _read(self, frames: Frames, num_frames: int) -> Real[Any, "B ..."]:
+        """Return the frames of samples as one array, and count invalid ones."""
+        radar = radar_batch(frames, self.grid, num_frames)
+        num_invalid = count_invalid(radar, warn=not self.num_invalid_frames)
+        with self._lock:
+            self.num_invalid_frames += num_invalid
+        return radar
 
     def _detect(self, inputs: Any, settings: Any) -> Detections:
         """Detect objects in at most as many frames as the largest batch size."""
@@ -312,18 +329,42 @@ class Detector:
         Therefore a result is yielded after the next item was requested: for a live sensor,
         call the detector instead.
 
+        For a model of several frames, the items are the frames of one sequence in their
+        order, and the stream keeps the preceding ones. The first frame is repeated in place
+        of those before it.
+
         Args:
-            frames: Items that `__call__` accepts as `frames`, or tuples of the frames,
-                image and camera of an item.
+            frames: Items that `__call__` of a model of one frame accepts as `frames`, or
+                tuples of the frames, image and camera of an item.
             **settings: Keyword arguments of `__call__`.
         """
         started: list[Detections] = []
+        history = None
         for item in frames:
-            inputs = item if isinstance(item, tuple) else (item,)
-            started.append(self(*inputs, **settings))
+            radar, *camera = item if isinstance(item, tuple) else (item,)
+            if self.num_frames > 1 and not isinstance(radar, Batch):
+                radar, history = self._samples(radar, history)
+            started.append(self(radar, *camera, **settings))
             if len(started) > 1:
                 yield started.pop(0)
         yield from started
+
+    def _samples(
+        self, frames: Frames, history: Float[np.ndarray, "T1 R A DE"] | None
+    ) -> tuple[Float[jax.Array, "B T R A DE"], Float[np.ndarray, "T1 R A DE"]]:
+        """Return the samples of consecutive frames, and the preceding ones of the next.
+
+        Args:
+            frames: Single frames as arrays or paths.
+            history: The last T - 1 projections, or None at the start of a sequence.
+        """
+        new, past = _projections(self._read(frames, 1), self.grid), self.num_frames - 1
+        if history is None:
+            history = np.repeat(new[:1], past, axis=0)
+        known = np.concatenate([history, new])
+        rows = np.arange(len(new))[:, None] + np.arange(self.num_frames)
+        # `count_invalid` counts the frames of NumPy arrays, which is done already.
+        return jnp.asarray(known[rows]), known[-past:]
 
     def warmup(self, *sample: Any) -> Detector:
         """Compile the model, so that the first call is fast.
@@ -340,7 +381,8 @@ class Detector:
             jax.block_until_ready(self(*sample))
             return self
         batch_size = sample[0] if sample else 1
-        shape = (batch_size, *self.grid.projection_shape)
+        steps = (self.num_frames,) if self.num_frames > 1 else ()
+        shape = (batch_size, *steps, *self.grid.projection_shape)
         inputs: tuple[Any, ...] = (np.zeros(shape, np.float32),)
         if self.takes_camera:
             images, camera = placeholder(batch_size, self.model)
@@ -367,6 +409,15 @@ class Detector:
         x = x.copy() if is_cpu else x
         placed = jax.make_array_from_process_local_data(self.sharding, x)
         return placed if is_cpu else jax.block_until_ready(placed)
+
+
+def _projections(
+    radar: Real[Array, "B ..."], grid: RadarGrid
+) -> Float[np.ndarray, "B R A DE"]:
+    """Compute the float32 projections of tesseracts, or convert stored projections."""
+    if radar.ndim == 5:
+        radar = grid.measured_channels(_project(radar))
+    return np.asarray(to_float(radar))
 
 
 def _padded(x: Shaped[Array, "b ..."], size: int) -> Shaped[Array, "{size} ..."]:
@@ -419,16 +470,19 @@ def as_numbers(values: Any, name: str) -> Any:
     return array.astype(array.dtype.newbyteorder("="), copy=False)
 
 
-def radar_batch(frames: Frames, grid: RadarGrid) -> Real[Any, "B ..."]:
+def radar_batch(
+    frames: Frames, grid: RadarGrid, num_frames: int = 1
+) -> Real[Any, "B ..."]:
     """Combine radar frames into one array with a leading axis B.
 
     Args:
         frames: Projections or tesseracts: an array, a path, or a list of arrays and
             paths, see `Detector.__call__`.
         grid: Axes of the sensor.
+        num_frames: Number T of frames of a sample.
 
     Returns:
-        Projections `[B, R, A, D+E]` or tesseracts `[B, D, R, E, A]`.
+        Projections `[B T, R, A, D+E]` or tesseracts `[B T, D, R, E, A]`.
 
     Raises:
         UserError: The shape is neither that of projections nor that of tesseracts, or
@@ -442,15 +496,19 @@ def radar_batch(frames: Frames, grid: RadarGrid) -> Real[Any, "B ..."]:
     radar = as_numbers(radar, "frames")
     shape = tuple(np.shape(radar))
     projection, tesseract = grid.projection_shape, grid.shape_drea
-    if shape in (projection, tesseract):
-        return radar[None]
-    if shape[1:] in (projection, tesseract) and shape[0]:
-        return radar
-    raise UserError(
-        f"frames have shape {list(shape)}; expected projections [B, R, A, D+E] = "
-        f"[B, {', '.join(map(str, projection))}] or tesseracts [B, D, R, E, A] = "
-        f"[B, {', '.join(map(str, tesseract))}]"
+    axes, steps = ("B", ()) if num_frames == 1 else (f"B, {num_frames}", (num_frames,))
+    for frame in (projection, tesseract):
+        if shape in ((*steps, *frame), (*shape[:1], *steps, *frame)) and shape[0]:
+            return radar.reshape(-1, *frame)
+    text = (
+        f"frames have shape {list(shape)}; expected projections [{axes}, R, A, D+E] = "
+        f"[{axes}, {', '.join(map(str, projection))}] or tesseracts [{axes}, D, R, E, A] = "
+        f"[{axes}, {', '.join(map(str, tesseract))}]"
     )
+    if steps:
+        text += f" of {num_frames} consecutive frames (config.data.num_frames), oldest "
+        text += "first; Detector.stream takes single frames and keeps preceding ones"
+    raise UserError(text)
 
 
 def count_invalid(frames: Real[Any, "B ..."], *, warn: bool) -> int:

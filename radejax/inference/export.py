@@ -110,7 +110,12 @@ def export(
     folder = files.as_path(folder)
     programs: dict[str, bytes] = {}
     grid, is_tensor = detector.grid, radar_input == "tensor"
-    shape = grid.shape_drea if is_tensor else grid.projection_shape
+    expected = "projection, as config.data.num_frames of the model is above 1"
+    is_possible = detector.num_frames == 1 or not is_tensor
+    require(is_possible, "input", radar_input, expected)
+    *bins, channels = grid.projection_shape
+    projection = *bins, detector.num_frames * channels
+    shape = grid.shape_drea if is_tensor else projection
     if kind == "stablehlo":
         programs = _stablehlo(detector, shape, platforms, batch_size, with_backbone)
     elif kind == "onnx":
@@ -128,7 +133,7 @@ def export(
     if kind == "stablehlo":
         loader = pathlib.Path(exported_loader.__file__)
         files.write_text(folder / "load.py", loader.read_text())
-    card = _readme(detector, is_tensor, content["left_out"])
+    card = _readme(detector, shape, content["left_out"])
     files.write_text(folder / "README.md", card)
     return {
         "bytes": sum(p.stat().st_size for p in folder.rglob("*") if p.is_file()),
@@ -136,12 +141,11 @@ def export(
     }
 
 
-def _readme(detector: Detector, is_tensor: bool, left_out: Sequence[str]) -> str:
+def _readme(detector: Detector, shape: Sequence[int], left_out: Sequence[str]) -> str:
     """Return the text of the model card."""
-    grid = detector.grid
-    radar = f"Projections [B, {', '.join(map(str, grid.projection_shape))}] float32"
-    if is_tensor:
-        radar = f"Power [B, {', '.join(map(str, grid.shape_drea))}] float32 of radar tensors"
+    radar = f"Projections [B, {', '.join(map(str, shape))}] float32"
+    if len(shape) == 4:
+        radar = f"Power [B, {', '.join(map(str, shape))}] float32 of radar tensors"
     config = detector.saved.config
     is_simulated = (config.get("simulation") or {}).get("scenes") == "procedural"
     return _MODEL_CARD.read_text().format(

@@ -70,6 +70,7 @@ def predict_dataset(
         max_objects=max([1, *(len(frame.boxes) for frame in frames)]),
         classes=detector.classes,
         images=images,
+        num_frames=detector.model.num_frames,
     )
     devices: set[Any] = detector.sharding.device_set
     num_devices, count = len(devices), len({d.process_index for d in devices})

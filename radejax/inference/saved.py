@@ -77,7 +77,8 @@ class SavedModel:
     @property
     def model(self) -> nn.Module:
         """The Flax module, without parameters."""
-        return models.build(self.config.model)
+        # Runs of earlier versions have no `num_frames`.
+        return models.build(self.config.model, self.config.data.get("num_frames", 1))
 
 
 def load_model(
@@ -94,7 +95,7 @@ def load_model(
         step: Step of the checkpoint, or "best"; the latest if None. Only for a workdir
             or its `checkpoints`.
         image_backbone: Weights of the image backbone, instead of those of the run: the
-            DINOv3 folder from Hugging Face, or torchvision's ResNet-50 file.
+            folder or file of DINOv3 or DINOv2, or torchvision's ResNet-50 file.
 
     Raises:
         FileNotFoundError: There is no model, or no such checkpoint.

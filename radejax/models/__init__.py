@@ -17,7 +17,7 @@ from radejax.models.radenet import RadeNet
 from radejax.models.vit import ViT
 
 
-def build(config: Mapping[str, Any]) -> nn.Module:
+def build(config: Mapping[str, Any], num_frames: int = 1) -> nn.Module:
     """Creates the model that `config.model` describes.
 
     Args:
@@ -25,6 +25,7 @@ def build(config: Mapping[str, Any]) -> nn.Module:
             that model. The fields of RADE-Net are the attributes of `RadeNet`, where `cbam`
             may be "off". DinoRADE additionally has the sections `image`, `fusion` and
             `query_grid`.
+        num_frames: `config.data.num_frames`, the number of frames of a sample.
 
     Returns:
         A Flax module without parameters.
@@ -38,7 +39,8 @@ def build(config: Mapping[str, Any]) -> nn.Module:
     check_options(fields, "config.model", {"name": one_of("radenet", "dinorade")})
     is_camera = fields.pop("name") == "dinorade"
     sections = ("image", "fusion", "query_grid") if is_camera else ()
-    _check_keys(fields, {*_own_fields(RadeNet), *sections}, "")
+    _check_keys(fields, {*_own_fields(RadeNet), *sections} - {"num_frames"}, "")
+    fields["num_frames"] = num_frames
     if fields["cbam"] == "off":
         fields["cbam"] = None
     try:

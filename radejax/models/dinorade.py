@@ -39,7 +39,9 @@ class DinoRade(RadeNet, kw_only=True):
         fusion: Fusion of radar and camera map. Its `num_groups`, `dtype` and `remat` are
             replaced by those of this module.
         query_grid: Axes of the centers of the radar queries.
-        image_size: Height and width of the images in pixels.
+        image_size: Height and width of the images in pixels. The transformer resizes them
+            to the nearest multiples of its patch size; reference points are fractions of
+            height and width, so that they also apply to resized images.
         freeze: Whether to stop gradients at the output of the image backbone.
         resnet_width: Channels of the ResNet's stem; not used with a `vit`.
         standardize_image: Whether to normalize images by ImageNet's mean and standard
@@ -63,13 +65,13 @@ class DinoRade(RadeNet, kw_only=True):
             self.freeze,
             "True for a ResNet, whose first stages have fixed batch statistics",
         )
-        stride = STRIDE if self.vit is None else self.vit.patch_size
+        least, step = (STRIDE, STRIDE) if self.vit is None else (self.vit.patch_size, 1)
         require(
             len(self.image_size) == 2
-            and all(n >= stride and n % stride == 0 for n in self.image_size),
+            and all(n >= least and n % step == 0 for n in self.image_size),
             "config.model.image.size",
             self.image_size,
-            f"height and width, multiples of {stride}",
+            f"height and width of at least {least} pixels, multiples of {step}",
         )
         require(
             self.fusion.out_of_view == "drop" or self.image_size[1] > 2 * MARGIN_PX,
@@ -145,7 +147,8 @@ class DinoRade(RadeNet, kw_only=True):
                 f"{'image' if image is None else 'camera'}: give both or none"
             )
         x = self._features(padded)
-        elevation = padded[..., self.doppler_bins :]
+        channels = padded.shape[-1] - self.elevation_bins
+        elevation = padded[..., channels:]  # of the last frame
         x = self.image_fusion(x, elevation, camera_map, reference, train=train)
         return self._maps(x, projection)
 
@@ -177,10 +180,10 @@ class DinoRade(RadeNet, kw_only=True):
     @property
     def feature_shape(self) -> tuple[int, int, int]:
         """Shape `(h, w, C)` of one image's features."""
-        stride = STRIDE if self.vit is None else self.vit.patch_size
-        channels = 16 * self.resnet_width if self.vit is None else self.vit.hidden_size
         height, width = self.image_size
-        return height // stride, width // stride, channels
+        if self.vit is None:
+            return height // STRIDE, width // STRIDE, 16 * self.resnet_width
+        return (*self.vit.grid(height, width), self.vit.hidden_size)
 
     @nn.nowrap
     def is_frozen(self, name: str) -> bool:

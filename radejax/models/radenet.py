@@ -65,6 +65,8 @@ class RadeNet(nn.Module):
         input_scale: Factor applied after the subtraction; 1 in the paper. An echo 10 dB
             above the noise differs from it by 0.054, and with a factor of 25 by 1.4, which
             is a usual magnitude of a network's input.
+        num_frames: Number of frames whose channels form the input, see
+            `radejax.data.projection.stack_frames`.
     """
 
     num_classes: int
@@ -85,10 +87,12 @@ class RadeNet(nn.Module):
     heatmap_prior: float = 0.5
     input_center: float = 0.0
     input_scale: float = 1.0
+    num_frames: int = 1
 
     def __post_init__(self) -> None:
         super().__post_init__()
         sizes = ["num_classes", "decoder_width", "num_groups", "pad_multiple"]
+        sizes += ["num_frames"]
         channels = ["doppler_bins", "elevation_bins"]
         ranges = {
             **dict.fromkeys(sizes, SIZE),
@@ -139,7 +143,8 @@ class RadeNet(nn.Module):
 
         Args:
             projection: `[B, R, A, D+E]` projections from `radejax.data.projection`, with
-                the Doppler channels first, in any float dtype.
+                the Doppler channels first, in any float dtype; for several frames as
+                `stack_frames` returns them.
             train: Has no effect; all models have this argument.
 
         Returns:
@@ -154,12 +159,13 @@ class RadeNet(nn.Module):
 
     def _padded(self, projection: Projection) -> Float[jax.Array, "B Rp Ap DE"]:
         """Centers and scales the projection, casts it to the model's dtype and pads it."""
-        channels = self.doppler_bins + self.elevation_bins
+        doppler = self.num_frames * self.doppler_bins
+        elevation = self.num_frames * self.elevation_bins
+        channels = doppler + elevation
         if projection.ndim != 4 or projection.shape[-1] != channels:
             raise UserError(
-                f"projection must be [B, R, A, {channels}] with {self.doppler_bins} "
-                f"Doppler and {self.elevation_bins} elevation channels, got "
-                f"{projection.shape}"
+                f"projection must be [B, R, A, {channels}] with {doppler} Doppler and "
+                f"{elevation} elevation channels, got {projection.shape}"
             )
         if (self.input_center, self.input_scale) != (0.0, 1.0):
             # This precedes the cast, because bfloat16 has steps of 0.7 dB near the noise.
@@ -172,7 +178,7 @@ class RadeNet(nn.Module):
     def _features(self, padded: Projection) -> Map:
         """Applies the backbone."""
         return self._stage(BACKBONES[self.backbone])(
-            doppler_bins=self.doppler_bins,
+            doppler_bins=self.num_frames * self.doppler_bins,
             widths=self.widths,
             decoder_width=self.decoder_width,
             cbam=self.cbam,

@@ -1,11 +1,12 @@
-"""Vision transformer with rotary position embedding, as in DINOv3.
+"""Vision transformer with rotary or learned position embedding, as in DINOv3 and DINOv2.
 
 No maintained package has a DINOv3 for Linen that reads the published weight files: Equimo
 uses Equinox and requires Python 3.12, and bonsai uses NNX and is pinned to an old jax.
 
 References:
-    Simeoni et al., DINOv3, arXiv:2508.10104. Names and numerics are checked against
-    `DINOv3ViTModel` of Hugging Face transformers.
+    Simeoni et al., DINOv3, arXiv:2508.10104; Oquab et al., DINOv2, arXiv:2304.07193;
+    Darcet et al., registers, arXiv:2309.16588. Names and numerics are checked against
+    Hugging Face transformers, Meta's code and timm.
 """
 
 from __future__ import annotations
@@ -37,7 +38,9 @@ class ViT(nn.Module):
     """Vision transformer, images `[B, H, W, 3]` -> tokens `[B, 1 + registers + patches, C]`.
 
     The tokens are the class token, the registers and the patches in row-major order, after
-    the final normalization. Height and width can be any multiples of the patch size.
+    the final normalization. An image whose height or width is not a multiple of the patch
+    size is first resized to the nearest multiples, with linear interpolation and
+    antialiasing; see `grid`.
 
     Attributes:
         hidden_size: Channels C of the tokens, a multiple of 4 times `num_heads`.
@@ -49,6 +52,9 @@ class ViT(nn.Module):
         gated_mlp: Whether to use a SwiGLU MLP, as in the larger DINOv3 models, instead of
             a GELU MLP.
         layer_scale: Initial value of the learned scales of the residual branches.
+        position_grid: Patches along each axis of DINOv2's learned position embedding,
+            which is interpolated to the patches of the image; 0 for DINOv3's rotary
+            embedding. The epsilon of the normalizations is that of the same model.
         attention: Implementation of the attention, see `attend`.
         dtype: Dtype of the computation; normalization statistics and the returned tokens
             are float32.
@@ -63,6 +69,7 @@ class ViT(nn.Module):
     num_registers: int = 4
     gated_mlp: bool = False
     layer_scale: float = 1.0
+    position_grid: int = 0
     attention: AttentionKind = "auto"
     dtype: Any = jnp.float32
     remat: bool = False
@@ -72,6 +79,7 @@ class ViT(nn.Module):
         sizes = ("hidden_size", "num_layers", "num_heads", "mlp_dim", "patch_size")
         ranges = dict.fromkeys(sizes, SIZE) | {
             "num_registers": integer(0, 1 << 16),
+            "position_grid": integer(0, 1 << 10),
             "attention": one_of(*get_args(AttentionKind)),
         }
         check_options(vars(self), "config.model.image", ranges)
@@ -87,17 +95,23 @@ class ViT(nn.Module):
         """Number of tokens before the first patch."""
         return 1 + self.num_registers
 
+    def grid(self, height: int, width: int) -> tuple[int, int]:
+        """Returns the rows and columns of patches of an image, rounded half up."""
+        size = self.patch_size
+        return (height + size // 2) // size, (width + size // 2) // size
+
     @nn.compact
     def __call__(
         self, image: Float[jax.Array, "B H W 3"]
     ) -> Float[jax.Array, "B T {self.hidden_size}"]:
         """Computes float32 tokens of normalized float images `[B, H, W, 3]`."""
-        rows, columns = (n // self.patch_size for n in image.shape[1:3])
-        height, width = rows * self.patch_size, columns * self.patch_size
-        chex.assert_shape(image, (None, height, width, 3))
+        chex.assert_shape(image, (None, None, None, 3))
+        rows, columns = self.grid(*image.shape[1:3])
+        size = (rows * self.patch_size, columns * self.patch_size)
+        image = jax.image.resize(image, (len(image), *size, 3), "linear")
         tokens = self._embed(image, rows, columns)
         head_dim = self.hidden_size // self.num_heads
-        rope = rotary_angles(rows, columns, head_dim)
+        rope = None if self.position_grid else rotary_angles(rows, columns, head_dim)
         block = nn.remat(Block, prevent_cse=False) if self.remat else Block
         # One block is traced for all layers; its parameters have a leading layer axis.
         layers = nn.scan(
@@ -117,7 +131,7 @@ class ViT(nn.Module):
             self.dtype,
             name="layers",
         )(tokens, rope)
-        return _layer_norm(jnp.float32, "norm")(tokens)
+        return _layer_norm(rope, jnp.float32, "norm")(tokens)
 
     def _embed(
         self, image: Float[jax.Array, "B H W 3"], rows: int, columns: int
@@ -131,8 +145,19 @@ class ViT(nn.Module):
             self.hidden_size, kernel_init=_INIT, dtype=self.dtype, name="patch_embed"
         )(patches)
         shape = (1, self.num_prefix, self.hidden_size)
-        prefix = self.param("prefix_tokens", _INIT, shape).astype(self.dtype)
-        prefix = jnp.broadcast_to(prefix, (b, *shape[1:]))
+        prefix = self.param("prefix_tokens", _INIT, shape)
+        if n := self.position_grid:
+            # Positions of the class token and of the patches.
+            shape = (1, 1 + n * n, self.hidden_size)
+            position = self.param("position_embedding", _INIT, shape)
+            prefix = prefix.at[:, :1].add(position[:, :1])
+            # transformers resamples with antialiasing only in models with registers.
+            smooth = self.num_registers > 0
+            axes = [bicubic_weights(n, m, antialias=smooth) for m in (rows, columns)]
+            grid = position[0, 1:].reshape(n, n, -1)
+            grid = jnp.einsum("rn,cm,nmd->rcd", *axes, grid, precision="highest")
+            patches += grid.reshape(1, rows * columns, -1).astype(self.dtype)
+        prefix = jnp.broadcast_to(prefix.astype(self.dtype), (b, *prefix.shape[1:]))
         return jnp.concatenate([prefix, patches], 1)
 
 
@@ -148,23 +173,26 @@ class Block(nn.Module):
     dtype: Any
 
     @nn.compact
-    def __call__(self, x: Tokens, rope: Rope) -> tuple[Tokens, None]:
-        y = _layer_norm(self.dtype, "norm_1")(x)
+    def __call__(self, x: Tokens, rope: Rope | None) -> tuple[Tokens, None]:
+        y = _layer_norm(rope, self.dtype, "norm_1")(x)
         x = x + self._scale("scale_1", x) * self._attend(y, rope)
-        y = _layer_norm(self.dtype, "norm_2")(x)
+        y = _layer_norm(rope, self.dtype, "norm_2")(x)
         x = x + self._scale("scale_2", x) * self._mlp(y)
         return x, None
 
-    def _attend(self, x: Tokens, rope: Rope) -> Tokens:
+    def _attend(self, x: Tokens, rope: Rope | None) -> Tokens:
         b, t, c = x.shape
+        # DINOv3 has no bias of the key, and DINOv2's does not change the result: without
+        # rotation it adds the same to all scores of a query.
         query, key, value = (
             self._dense(c, name, use_bias=name != "key")(x).reshape(
                 b, t, self.num_heads, -1
             )
             for name in ("query", "key", "value")
         )  # [B, T, heads, C / heads]
-        query = rotate(query, rope, self.num_prefix)
-        key = rotate(key, rope, self.num_prefix)
+        if rope is not None:
+            query = rotate(query, rope, self.num_prefix)
+            key = rotate(key, rope, self.num_prefix)
         y = attend(query, key, value, self.attention).reshape(b, t, c)
         return self._dense(c, "out")(y)
 
@@ -185,12 +213,42 @@ class Block(nn.Module):
         return scale[None, None]
 
 
-def _layer_norm(dtype: Any, name: str) -> nn.LayerNorm:
+def _layer_norm(rope: Rope | None, dtype: Any, name: str) -> nn.LayerNorm:
+    epsilon = 1e-6 if rope is None else 1e-5  # DINOv2's and DINOv3's
     # The fast variance E[x^2] - E[x]^2 is imprecise if the mean is large.
-    return nn.LayerNorm(1e-5, dtype=dtype, use_fast_variance=False, name=name)
+    return nn.LayerNorm(epsilon, dtype=dtype, use_fast_variance=False, name=name)
 
 
-# Rotary embedding --------------------------------------------------------------------
+# Position embeddings -----------------------------------------------------------------
+
+
+def bicubic_weights(
+    old: int, new: int, *, antialias: bool
+) -> Float[np.ndarray, "{new} {old}"]:
+    """Computes the weights of bicubic resampling along one axis, as in torch.
+
+    The values are those of `torch.nn.functional.interpolate(..., mode="bicubic",
+    align_corners=False)`.
+
+    Args:
+        old: Number of samples.
+        new: Number of resampled values.
+        antialias: Whether the kernel is stretched where the number decreases. Then, samples
+            beyond the border have no weight; otherwise the border is repeated. The cubic
+            kernel's parameter also differs, as in torch.
+    """
+    a, stretch = (-0.5, max(old / new, 1.0)) if antialias else (-0.75, 1.0)
+    centers = (np.arange(new)[:, None] + 0.5) * old / new - 0.5
+    samples = np.arange(-2, old + 2)
+    d = np.abs(samples - centers) / stretch
+    near = ((a + 2) * d - (a + 3)) * d * d + 1
+    far = a * (((d - 5) * d + 8) * d - 4)
+    weights = np.where(d < 1, near, np.where(d < 2, far, 0.0))
+    if antialias:
+        weights = weights[:, 2:-2] / weights[:, 2:-2].sum(1, keepdims=True)
+    else:
+        weights = weights @ np.eye(old)[samples.clip(0, old - 1)]
+    return weights.astype(np.float32)
 
 
 def rotary_angles(rows: int, columns: int, head_dim: int, theta: float = 100.0) -> Rope:

@@ -54,6 +54,7 @@ _DATA = {
         "different sequence numbers, or one fraction between 0 and 1; () for none",
     ),
     "validation_seed": _SEED,
+    "num_frames": integer(1),
     "max_objects": integer(1),
     "azimuth_mapping": one_of("true", "stretched"),
     "num_threads": integer(0),
@@ -63,6 +64,7 @@ _DATA = {
 _TRAIN = {
     "batch_size": integer(1),
     "num_epochs": integer(1),
+    "max_steps": or_none(integer(1)),
     "learning_rate": POSITIVE,
     "final_learning_rate": number(0),
     "schedule": one_of("cosine", "cyclic_cosine"),
@@ -114,7 +116,7 @@ def check(config: ConfigDict) -> None:
         names, expected = (lambda name: isinstance(name, str), ""), "different names"
     check_options(config, "config", {"classes": several(names, expected, least=1)})
     for section, construct in (
-        ("model", lambda: models.build(config.model)),
+        ("model", lambda: models.build(config.model, config.data.num_frames)),
         ("loss", lambda: LossOptions(**config.loss.to_dict())),
         ("decode", lambda: DecodeOptions(**config.decode)),
         ("data.camera", lambda: CameraOptions.from_config(config.data)),

@@ -219,7 +219,12 @@ class Data:
             max_objects=options.max_objects,
             classes=self.classes,
             images=images,
+            num_frames=options.num_frames,
         )
+        count = options.num_frames
+        is_useful = count == 1 or any(len(set(keys)) > 1 for keys in table.keys)
+        expected = "1, as no frame to train on has the preceding one of its sequence"
+        require(is_useful, "config.data.num_frames", count, expected)
         if (shuffled := options.label_permutation_seed) is not None:
             order = np.random.default_rng(shuffled).permutation(len(table))
             boxes, classes = table.boxes[order], table.classes[order]

@@ -7,7 +7,7 @@ import json
 import logging
 import math
 import pathlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -22,6 +22,7 @@ from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.pipeline import require_images
 from radejax.data.projection import decode
 from radejax.evaluation.boxes import Columns, roi_bounds, tables_from_frames
+from radejax.evaluation.evaluation_set import Result
 from radejax.evaluation.report import Report, write_report
 from radejax.evaluation.results import EvaluationOptions, evaluate_tables
 from radejax.inference.detector import Detector, check_backbone
@@ -123,19 +124,14 @@ class Evaluation:
         options = dataclasses.replace(self._options, bootstrap=0)
         tables = self._truth, predictions, self._table
         _, results = evaluate_tables(*tables, options, per_weather=False)
-        values, best = {}, None
-        for result in filter(lambda result: result.is_defined, results):
-            name = f"{result.metric}/{result.cls}"
-            if result.cls == "mean":
-                name = f"m{result.metric}"
-                is_main = result.protocol == options.protocols[0]
-                if is_main and name.split("/")[0] == self._config.train.best_metric:
-                    best = None if math.isnan(result.ap) else result.ap
-            values[f"validation/{name}"] = result.ap
+        aps = named_aps(results)
+        main = f"{self._config.train.best_metric}/{options.protocols[0]}/"
+        best = next((ap for name, ap in aps.items() if name.startswith(main)), math.nan)
         count = self._config.logging.num_visualizations
         drawn = distributed.main_only(lambda: dict(self._figures(predictions, count)))
+        values = {f"validation/{name}": ap for name, ap in aps.items()}
         named = {f"validation/{name}": figure for name, figure in (drawn or {}).items()}
-        return Scores(values, best, named)
+        return Scores(values, None if math.isnan(best) else best, named)
 
     def report(
         self,
@@ -196,21 +192,22 @@ class Evaluation:
         """Write figures of frames, a figure of all weathers, and the loss curves."""
         frames = self._frames
         suffix = ", simulated" if frames.is_simulated else ""
+        ending = self._options.figures
         for name, figure in self._figures(
             predictions, self._options.num_visualizations
         ):
-            save_figure(figure, folder / "figures" / f"{name}.png")
+            save_figure(figure, folder / "figures" / f"{name}.{ending}")
         if (folder / "figures").exists():  # the layout of RADE-Net's Figure 4
             scenes = [
                 self._scene(predictions, i, title=f"{name} ({frames[i].key}){suffix}")
                 for name, i in figures.fullest_of_weathers(frames).items()
             ]
-            save_figure(draw_scenes(scenes), folder / "scenes.png")
+            save_figure(draw_scenes(scenes), folder / f"scenes.{ending}")
         if (workdir / "metrics.jsonl").exists():
             series = curves.read_metrics(workdir / "metrics.jsonl")
             if losses := [name for name in LOSSES if name in series]:
                 figure = curves.draw_training(series, losses, workdir.name + suffix)
-                save_figure(figure, folder / "training.png")
+                save_figure(figure, folder / f"training.{ending}")
 
     def _scene(self, predictions: Columns, index: int, **fields: Any) -> Scene:
         """Return the scene of a frame with its boxes and image.
@@ -244,6 +241,19 @@ class Evaluation:
             yield name, draw_frame(self._scene(predictions, index))
 
 
+_SAME_NUMBERS = ("bootstrap", "batch_size", "num_visualizations", "figures", "plots")
+"""Options of an evaluation that do not change its APs."""
+
+
+def named_aps(results: Sequence[Result]) -> dict[str, float]:
+    """Return the APs over all frames by metric and class, and means by m and metric."""
+    return {
+        f"m{x.metric}" if x.cls == "mean" else f"{x.metric}/{x.cls}": x.ap
+        for x in results
+        if x.is_defined and x.condition == "all"
+    }
+
+
 def evaluate_run(
     workdir: PathLike,
     *,
@@ -262,13 +272,13 @@ def evaluate_run(
         workdir: Workdir of `train.py`.
         step: Step of the checkpoint, or "best"; the latest if None.
         split: "test", "validation", "train", "all" or the path of a split file.
-        out: Folder of the results. If None, it is `evaluation` in the workdir, or
-            `evaluation_<name>` for other data, with `_validation` appended for that split.
+        out: Folder of the results. If None, it is `evaluation` in the workdir, with other
+            data, split, checkpoint and changes that change numbers appended to the name,
+            such as `evaluation_all_roi_wide`.
         image_backbone: Weights of a frozen backbone, see `load_model`.
         shuffle_images: Seed with which every frame with an image gets the image and
             camera of another frame, or None. This is a sanity check of how much a
-            radar-camera model uses the images. `_shuffled` is appended to the default
-            `out`.
+            radar-camera model uses the images.
         other: Fields of `config.data` to replace, such as `{"roots": ("/data",)}`.
         run: Name of the run in the report; the workdir's name if None.
         **changes: Fields of `EvaluationOptions` to replace.
@@ -286,11 +296,18 @@ def evaluate_run(
     workdir = files.as_path(workdir).absolute()
     if not saved.run:
         raise UserError(f"{workdir} is not a run: give a workdir of train.py")
-    EvaluationOptions.from_config(saved.config, **changes)  # reading labels takes long
+    usual = EvaluationOptions.from_config(saved.config)
+    # This fails before labels are read, which takes long.
+    EvaluationOptions.from_config(saved.config, **changes)
     config, data = data_of_run(saved, other)
     name = "evaluation" if other is None else f"evaluation_{data_name(other)}"
-    name += "_validation" if split == "validation" else ""
+    name += "" if split == "test" else f"_{files.as_path(split).stem}"
     name += "" if shuffle_images is None else "_shuffled"
+    name += "" if step is None else f"_checkpoint_{step}"
+    for field, value in changes.items():
+        if field not in _SAME_NUMBERS and value != getattr(usual, field):
+            values = value if isinstance(value, tuple) else (value,)
+            name += "_".join(["", field, *(str(x).replace(" ", "-") for x in values)])
     run = run or workdir.name
     if step == "best" and other is None and split in (data.choosing_split, "all"):
         run += f" (chosen on the {data.choosing_split} split)"

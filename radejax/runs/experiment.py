@@ -8,7 +8,7 @@ run.json         versions, command, weights that the training started from
 checkpoints/     the newest checkpoints and the best one, by step
 metrics.jsonl    losses by step; tensorboard/ has the same values
 evaluation/      metrics.json, metrics.csv, tables and figures of the last evaluation;
-                 evaluation_<name>/ has those on other data, described by its source.json
+                 evaluation_<name>/ has those with other options or on other data
 lock             lock file, which the running training holds
 """
 
@@ -28,7 +28,6 @@ from typing import Any
 import jax
 import numpy as np
 from ml_collections import ConfigDict
-from tabulate import tabulate
 
 import radejax
 from radejax import models
@@ -38,6 +37,7 @@ from radejax.core.errors import require
 from radejax.core.files import PathLike
 from radejax.data.dataset import FrameSequence
 from radejax.data.records import open_embeddings
+from radejax.evaluation.report import Table, number, numbers, write_tables
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.saved import (
     FROZEN_BACKBONE,
@@ -46,8 +46,10 @@ from radejax.inference.saved import (
 )
 from radejax.runs import checks
 from radejax.runs.data import located, open_data
-from radejax.runs.evaluate import Evaluation
+from radejax.runs.evaluate import Evaluation, named_aps
 from radejax.training import distributed, loop
+from radejax.training.metric_logger import log_results
+from radejax.weights.image_backbone import check_fits
 
 _log = logging.getLogger(__name__)
 
@@ -81,13 +83,15 @@ def run(
     checks.check(config)
     config, folder = located(config), files.as_path(workdir).absolute()
     distributed.check_batch_size(config.train.batch_size)
-    model, digest = models.build(config.model), None
+    model, digest = models.build(config.model, config.data.num_frames), None
     if config.data.embeddings is not None:
         embeddings = open_embeddings(config.data.embeddings)
         digest = embeddings.source["weights_sha256"]
     weights = starting_weights(
         config.model, init_from, config.data.image_backbone, digest
     )
+    if weights.variables is not None:
+        check_fits(model, weights.variables, str(init_from))
     with claimed(folder, config):
         data = open_data(config, model)
         frames, grid = data.split("train"), data.records.grid
@@ -123,7 +127,9 @@ def run(
             return folder
         if has_test:
             evaluation = Evaluation(config, data)
-            evaluation.report(state.eval_variables, folder, step=step)
+            report = evaluation.report(state.eval_variables, folder, step=step)
+            if report is not None:
+                log_results(folder, step, named_aps(report.results))
     place = files.relative(folder)
     _log.info(
         "Done in %s. Evaluate again: radejax evaluate %s. Boxes of frames: radejax detect "
@@ -234,7 +240,7 @@ def _invariants(frames: FrameSequence, weights: StartingWeights) -> dict[str, An
 
 # Several seeds -----------------------------------------------------------------------
 
-_KEYS = ("protocol", "condition", "cls", "space", "iou")
+_KEYS = ("name", "protocol", "score_threshold", "condition", "cls", "space", "iou")
 
 
 def run_seeds(
@@ -254,8 +260,9 @@ def run_seeds(
         **options: Further arguments of `run`.
 
     Returns:
-        The absolute path of the workdir. Its files `seeds.json` and `seeds.txt` contain
-        the mean and standard deviation over the finished seeds.
+        The absolute path of the workdir. Its files `seeds.json`, `seeds.txt`,
+        `seeds.md` and `seeds.tex` contain the mean and standard deviation over the finished
+        seeds.
 
     Raises:
         UserError: Two seeds are equal, or `run` raises it.
@@ -290,10 +297,10 @@ def _write_summary(
     seed.
 
     Args:
-        workdir: Folder of `seeds.json` and `seeds.txt`.
+        workdir: Folder of `seeds.json`, `seeds.txt`, `seeds.md` and `seeds.tex`.
         tables: APs by seed and by the values of `_KEYS`.
     """
-    rows, lines = [], []
+    rows, lines = list[dict[str, Any]](), []
     first, *others = tables.values()
     for key in (key for key in first if all(key in table for table in others)):
         values = {seed: table[key] for seed, table in tables.items()}
@@ -302,9 +309,17 @@ def _write_summary(
         row["mean"] = float(np.mean(aps))
         row["std"] = float(np.std(aps, ddof=1)) if others else None
         rows.append({**row, "values": values})
-        if row.pop("condition") == "all":
-            lines.append(row | {f"seed {seed}": ap for seed, ap in values.items()})
-    text = tabulate(lines, headers="keys", floatfmt=".2f", missingval="-")
+        if row["condition"] == "all":
+            terms = f"{row['protocol']}, score>{float(row['score_threshold']):g}"
+            line = row["cls"], terms, row["space"].upper(), row["iou"]
+            mean = f"{number(row['mean'])} ± {number(row['std'])}"
+            lines.append([*line, mean, *numbers(aps)])
+    title = f"AP, mean ± standard deviation over {len(tables)} seeds, all weathers"
+    header = ["Class", "Protocol", "AP", "IoU", "Mean", *(f"Seed {x}" for x in tables)]
+    table = Table(title, header, lines)
+    is_simulated = rows[0]["name"].endswith("/simulated")
+    text = table.render(is_simulated=is_simulated)
     files.write_json(workdir / "seeds.json", rows)
     files.write_text(workdir / "seeds.txt", text)
+    write_tables(workdir / "seeds", [table], is_simulated=is_simulated)
     _log.info("%s\nWritten to %s", text, workdir)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
-import flax.linen as nn
 import jax
 import numpy as np
 from jaxtyping import Float
@@ -13,6 +12,7 @@ from jaxtyping import Float
 from radejax.core.structures import Boxes
 from radejax.data.dataset import FrameSequence, LabelledFrame, front_view
 from radejax.data.kradar.conditions import WEATHERS
+from radejax.data.pipeline import read_sample, sample_keys
 from radejax.data.projection import decode
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.runs.data import Data
@@ -59,7 +59,7 @@ def spread(values: Any, count: int) -> list[Any]:
 
 
 def frame_shares(
-    model: nn.Module,
+    model: Any,
     variables: Mapping[str, Any],
     data: Data,
     frames: FrameSequence,
@@ -85,8 +85,9 @@ def frame_shares(
         return sown["intermediates"]["image_fusion"]["camera_share"][0][0]
 
     variables = jax.device_put(dict(variables))
+    keys = sample_keys(data.records, frames, model.num_frames)
     for index, frame in enumerate(frames):
-        projection = decode(data.records[frame.key])
+        projection = decode(read_sample(data.records, keys[index]))
         inputs = projection, images.image(index), images.cameras[index]
         yield frame, np.asarray(share_of(variables, *inputs), np.float64)
 

@@ -84,7 +84,8 @@ class SimulationConfig:
         sequences: Numbers of the sequences to use from real labels, or None for all.
         label_version: Version of the real labels.
         frames_per_sequence: Number of frames per sequence, at 10 frames per second in
-            procedural scenes; 0 uses all frames of real labels.
+            procedural scenes; 0 uses all frames of real labels. Two or more frames of
+            real labels are in both splits of K-Radar.
         frame_stride: Stride at which the frames of real labels are used.
         vru_density_scale: Factor on the number of pedestrians, motorcycles and bicycles
             in procedural training scenes, at most 5. Test scenes are not affected.

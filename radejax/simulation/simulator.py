@@ -299,8 +299,13 @@ class LabelSource:
         names = [f.name for f in frames]
         train = set(split_by_rule(names, "train"))
         chosen = range(0, len(frames), config.frame_stride)
-        if config.frames_per_sequence:
-            chosen = chosen[: config.frames_per_sequence]
+        if count := config.frames_per_sequence:
+            # The first frames can all be in the train split. Half of the chosen ones are
+            # then those before the first test frame.
+            is_test = [names[index] not in train for index in chosen]
+            first_test = is_test.index(True) if True in is_test else 0
+            start = first_test - (count + 1) // 2 if count <= first_test else 0
+            chosen = chosen[start : start + count]
         return [
             FrameSpec(
                 scene_idx=index,

@@ -14,6 +14,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import numpy as np
+import optax
 from jax.extend.core import ClosedJaxpr
 from jax.interpreters import partial_eval
 from ml_collections import ConfigDict
@@ -30,6 +31,7 @@ from radejax.training.step import (
     Metrics,
     Step,
     TrainState,
+    count_steps,
     create_state,
     make_optimizer,
     make_schedule,
@@ -63,7 +65,7 @@ def train(
     evaluate: Evaluate | None = None,
     profile: str = "",
 ) -> tuple[TrainState, bool]:
-    """Trains a model for the configured epochs, or continues from the newest checkpoint.
+    """Trains a model for the configured epochs or steps, or continues from the newest checkpoint.
 
     Args:
         config: Config of the run, which `radejax.runs.checks.check` has checked. The
@@ -94,8 +96,9 @@ def train(
             space is left on the disk.
     """
     options, folder = config.train, files.as_path(workdir)
+    schedule = make_schedule(options, steps_per_epoch)
     optimizer = make_optimizer(
-        make_schedule(options, steps_per_epoch),
+        schedule,
         weight_decay=options.weight_decay,
         gradient_clip_norm=options.gradient_clip_norm,
         gradient_accumulation_steps=options.gradient_accumulation_steps,
@@ -119,14 +122,14 @@ def train(
             checkpoints, loader, info, initial, create, mesh, options.parameter_sharding
         )
         train_step = _compile(step_fn, state, mesh, config.seed)
-        num_steps = steps_per_epoch * options.num_epochs
+        num_steps = count_steps(options, steps_per_epoch)
         with (
             MetricLogger(folder, config, int(state.step), num_steps) as logger,
             distributed.stop_on_signal(mesh) as stop,
         ):
             run = _Run(
                 *(config, steps_per_epoch, num_steps, loader, info, evaluate),
-                *(checkpoints, logger, stop),
+                *(checkpoints, logger, stop, schedule),
             )
             return run.take_steps(train_step, state, profile)
 
@@ -154,6 +157,7 @@ class _Run:
     checkpoints: Checkpoints
     logger: MetricLogger
     stop: Callable[[], bool]
+    schedule: optax.Schedule
     num_skipped: int = 0  # steps that were skipped and reported so far
 
     def take_steps(
@@ -185,7 +189,8 @@ class _Run:
         self.logger.advance(step, metrics)
         is_logged = self._is_due(step, train.log_every_steps)
         if is_logged:
-            self.logger.log(step, metrics, epoch=step / self.steps_per_epoch)
+            rate = {"learning_rate": self.schedule(step - 1)}
+            self.logger.log(step, metrics | rate, epoch=step / self.steps_per_epoch)
         scores = None
         every = self.steps_per_epoch * train.evaluate_every_epochs
         if self.evaluate is not None and self._is_due(step, every):

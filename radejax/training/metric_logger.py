@@ -177,6 +177,14 @@ class MetricLogger:
             self._wandb.finish()
 
 
+def log_results(folder: pathlib.Path, step: int, values: Mapping[str, float]) -> None:
+    """Writes the APs of the report of a finished run to its TensorBoard folder."""
+    place = str(folder / "tensorboard")
+    with tensorboardX.SummaryWriter(place, filename_suffix=".test") as board:
+        for name, value in values.items():
+            board.add_scalar(f"test/{name}", value, step)
+
+
 def _remove_after(step: int, path: pathlib.Path) -> None:
     """Removes records after a step, and a last line that a killed run left incomplete."""
     lines = files.read_text(path).splitlines(keepends=True)

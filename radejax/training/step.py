@@ -29,6 +29,12 @@ Step = Callable[["TrainState", Batch, jax.Array], tuple["TrainState", Metrics]]
 # Optimizer ---------------------------------------------------------------------------
 
 
+def count_steps(train: ConfigDict, steps_per_epoch: int) -> int:
+    """Returns the number of steps of a training with the section `config.train`."""
+    steps: int = steps_per_epoch * train.num_epochs
+    return steps if train.max_steps is None else min(train.max_steps, steps)
+
+
 def make_schedule(train: ConfigDict, steps_per_epoch: int) -> optax.Schedule:
     """Linear warm-up from zero, then a cosine between the peak and the minimum.
 
@@ -48,7 +54,7 @@ def make_schedule(train: ConfigDict, steps_per_epoch: int) -> optax.Schedule:
         UserError: The warm-up is not shorter than the training.
     """
     peak, minimum = train.learning_rate, train.final_learning_rate
-    num_steps, warmup_steps = steps_per_epoch * train.num_epochs, train.warmup_steps
+    num_steps, warmup_steps = count_steps(train, steps_per_epoch), train.warmup_steps
     require(
         warmup_steps < num_steps,
         "config.train.warmup_steps",

@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 
@@ -22,6 +23,7 @@ from radejax.visualize.style import (
     Style,
     draw_labels,
     draw_lines,
+    draw_points,
     label_texts,
     line_scales,
     new_figure,
@@ -42,6 +44,7 @@ def draw_camera(
     ax: Axes | None = None,
     show_labels: bool = True,
     title: str = "",
+    lidar_m: Float[np.ndarray, "N 3"] | None = None,
 ) -> Axes:
     """Draw the edges and the tinted front faces of 3D boxes on an image.
 
@@ -53,6 +56,7 @@ def draw_camera(
         ax: Axes to draw on; a new figure by default.
         show_labels: Whether to write class and score at the boxes.
         title: Title of the axes.
+        lidar_m: LiDAR points in the radar frame in meters, or None.
 
     Returns:
         The axes, in pixels of the image.
@@ -80,6 +84,9 @@ def draw_camera(
     # Pixel centers are integers in imshow and half-integers in the calibration.
     ax.set(xlim=(-0.5, calibration.width - 0.5), ylim=(calibration.height - 0.5, -0.5))
     ax.apply_aspect()
+    if lidar_m is not None:
+        pixels, depth_m = calibration.project_ego(lidar_m)
+        draw_points(ax, pixels[calibration.in_image(pixels, depth_m)] - 0.5)
     labels = []
     for style, boxes in styled_sets(ground_truth, predictions):
         labels += _draw_boxes(ax, calibration, boxes, style)

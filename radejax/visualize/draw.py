@@ -32,12 +32,14 @@ from radejax.visualize.camera import draw_camera
 from radejax.visualize.style import (
     COLOR_MAP,
     GROUND_TRUTH,
+    LIDAR_COLOR,
     ROI_COLOR,
     Label,
     Scene,
     color_limits_of,
     draw_labels,
     draw_lines,
+    draw_points,
     draw_tiles,
     footprints,
     halo,
@@ -145,6 +147,8 @@ def _draw_ground(scene: Scene, **options: Any) -> Axes:
     """Draw map, region, boxes and sensor; `options` are passed to `draw_map`."""
     extent = _extent_m(scene.grid, scene.roi)
     ax = draw_map(scene.power, scene.grid, extent=extent, **options)
+    if scene.lidar_m is not None:
+        draw_points(ax, scene.lidar_m[:, 1::-1])
     _draw_over(ax, scene, lambda points: points[..., ::-1])
     # The sensor is drawn as a triangle that points ahead.
     ax.plot([0.0], [0.0], "^", color="black", mec="white", ms=8, zorder=7)
@@ -275,6 +279,7 @@ def _draw_view(ax: Axes, scene: Scene, *, show_labels: bool = True) -> None:
         predictions=scene.predictions,
         ax=ax,
         show_labels=show_labels,
+        lidar_m=scene.lidar_m,
     )
 
 
@@ -363,6 +368,9 @@ def _legend_handles(scene: Scene, *, show_counts: bool = True) -> list[Line2D]:
         line = Line2D([], [], color=style.color, lw=style.width, label=label)
         line.set_path_effects(halo(style.width + 1.4))
         handles.append(line)
+    if scene.lidar_m is not None:
+        color = LIDAR_COLOR
+        handles.append(Line2D([], [], marker=".", ls="", color=color, label="LiDAR"))
     if scene.roi is not None:
         named = [name for name, roi in ROIS.items() if roi == tuple(scene.roi)]
         label = f"{named[0]} region" if named else "region of interest"

@@ -35,6 +35,7 @@ COLOR_MAP = LinearSegmentedColormap.from_list(
     "radar", matplotlib.colormaps["viridis"](np.linspace(0.0, 0.82, 256))
 )
 ROI_COLOR = "black"
+LIDAR_COLOR = "#ffa64d"
 # The color-blind safe palette of Okabe and Ito, with a yellow that is visible on paper.
 SERIES_COLORS = (
     *("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"),
@@ -80,6 +81,8 @@ class Scene:
         title: Title, such as sequence, frame and weather.
         score_threshold: Score threshold of the predictions for the legend, or None.
         time_s: Seconds since the Unix epoch for recordings, or None.
+        lidar_m: LiDAR points `[N, 3]` in the radar frame in meters, drawn on ground plane and
+            image; or None.
 
     Raises:
         UserError: The projection does not match the grid, or the boxes belong to several
@@ -96,6 +99,7 @@ class Scene:
     title: str = ""
     score_threshold: float | None = None
     time_s: float | None = None
+    lidar_m: Float[np.ndarray, "N 3"] | None = None
 
     def __post_init__(self) -> None:
         shape = np.shape(self.projection)
@@ -172,6 +176,12 @@ def draw_tiles(
     return ax.pcolormesh(
         edges_x, edges_y, values, cmap=COLOR_MAP, vmin=low, vmax=high, rasterized=True
     )
+
+
+def draw_points(ax: Axes, points: Float[np.ndarray, "N 2"]) -> None:
+    """Draw LiDAR points on axes of fixed limits, below the lines of boxes."""
+    x, y = points.T
+    ax.scatter(x, y, s=0.6, color=LIDAR_COLOR, lw=0, zorder=2, rasterized=True)
 
 
 def draw_lines(

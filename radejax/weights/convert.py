@@ -167,6 +167,7 @@ def _torch_axes(path: str, ndim: int) -> tuple[int, ...]:
 def variable_shapes(model: Any) -> dict[str, tuple[int, ...]]:
     """Return the shapes of a detector's variables by path, without creating the variables."""
     bins, channels = model.pad_multiple, model.doppler_bins + model.elevation_bins
+    channels *= model.num_frames
 
     def array(*shape: int, dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct((1, *shape), dtype)

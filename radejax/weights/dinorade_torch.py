@@ -13,7 +13,7 @@ from typing import Any, cast
 
 from radejax import models
 from radejax.core.config import load_config
-from radejax.core.errors import DataError
+from radejax.core.errors import DataError, require
 from radejax.core.files import PathLike
 from radejax.models.dinorade import IMAGE_BACKBONE, DinoRade
 from radejax.weights import dinov3_hf, radenet_torch
@@ -108,6 +108,7 @@ def _transformer(
     """Return fields and parameters of the transformer in the folder, else the checkpoint."""
     if dinov3 is not None:
         vit, variables = dinov3_hf.load(dinov3)
+        require(not vit.position_grid, str(dinov3), "DINOv2", f"DINOv3 as in {source}")
         return dinov3_hf.image_fields(vit), variables["params"]
     # PEFT and transformers add prefixes to the names of the backbone.
     start = re.compile(rf"{IMAGE_BACKBONE}\.(base_model\.model\.)?(model\.)?")

@@ -1,12 +1,23 @@
-"""Conversion of DINOv3 weights between Hugging Face's format and Flax, without torch.
+"""Conversion of DINOv3 and DINOv2 weights to Flax, without torch.
 
-The weights are gated and their license restricts redistribution: every user must download
-them, and published checkpoints must not contain them.
+| model | from | path |
+|---|---|---|
+| DINOv3 | Hugging Face transformers | folder with `config.json` and `model.safetensors` |
+| DINOv3 | timm | such a folder, or `model.safetensors` |
+| DINOv3 | Meta | `.pth` file |
+| DINOv2, with and without registers | Hugging Face transformers | folder |
+
+DINOv3 is also written, in the format of Hugging Face. Its weights are gated and their license
+restricts redistribution: every user must download them, and published checkpoints must not
+contain them. DINOv2's license is Apache-2.0.
 """
 
 from __future__ import annotations
 
 import contextlib
+import math
+import pathlib
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -16,11 +27,11 @@ import numpy as np
 import safetensors.numpy
 
 from radejax.core import files
-from radejax.core.archives import read_safetensors
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import PathLike
 from radejax.models.vit import ViT
-from radejax.weights.convert import Rules, from_torch, shapes_of, to_numpy, to_torch
+from radejax.weights import convert
+from radejax.weights.convert import Rules, to_numpy
 
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
@@ -35,6 +46,9 @@ _FIELDS = {
     "use_gated_mlp": "gated_mlp",
 }
 """Attributes of `ViT` by the name of the corresponding field of Hugging Face's config."""
+
+_KINDS = r"dinov3_vit|dinov2|dinov2_with_registers|vit_\w+_dinov3(_qkvb)?"
+"""Names of models in transformers ("model_type") and, with "vit", in timm ("architecture")."""
 
 
 def _constants(gated_mlp: bool) -> dict[str, Any]:
@@ -53,9 +67,17 @@ def _constants(gated_mlp: bool) -> dict[str, Any]:
     }
 
 
+_DINOV2_CONSTANTS = {"layer_norm_eps": 1e-6, "qkv_bias": True, "hidden_act": "gelu"}
+"""The same for DINOv2, whose SwiGLU has SiLU for any `hidden_act`."""
+
+
+# Names -------------------------------------------------------------------------------
+
 _CLASS, _REGISTERS = "embeddings.cls_token", "embeddings.register_tokens"
+_POSITIONS, _PERIODS = "embeddings.position_embeddings", "rope_embed.periods"
 _RULES: Rules = (
     (r"^prefix_tokens", _CLASS),
+    (r"^position_embedding", _POSITIONS),
     (r"^patch_embed/", "embeddings.patch_embeddings."),
     (r"^norm/", "norm."),
     (r"^layers/norm_(\d)/", r"layer.{}.norm\1."),
@@ -66,14 +88,67 @@ _RULES: Rules = (
     ),
     (r"^layers/(up|gate|down)/", r"layer.{}.mlp.\1_proj."),
 )
-"""Rules from modules of `ViT` to Hugging Face's names, for `convert`."""
+"""Rules from modules of `ViT` to DINOv3's names in Hugging Face, for `convert`.
+
+The rules below lead from other names to these. A name with `(q|k|v)` stands for several
+tensors, into which the tensor is split along its first axis.
+"""
+
+_META_AND_TIMM: Rules = (
+    (r"^cls_token$", _CLASS),
+    (r"^(storage_tokens|reg_token)$", _REGISTERS),
+    (r"^patch_embed\.proj\.", "embeddings.patch_embeddings."),
+    (r"^blocks\.", "layer."),
+    (r"\.attn\.qkv\.", ".attention.(q|k|v)_proj."),
+    (r"\.attn\.([qv])_bias$", r".attention.\1_proj.bias"),  # timm
+    (r"\.attn\.proj\.", ".attention.o_proj."),
+    (r"\.(?:ls|gamma_)(\d)(?:\.gamma)?$", r".layer_scale\1.lambda1"),
+    (r"\.(fc1|w2|fc1_x)\.", ".up_proj."),
+    (r"\.(w1|fc1_g)\.", ".gate_proj."),
+    (r"\.(fc2|w3)\.", ".down_proj."),
+)
+_DINOV2: Rules = (  # in Hugging Face, where transformers 5 adds "model." to some names
+    (r"^(model|encoder)\.", ""),
+    (r"^layernorm\.", "norm."),
+    (r"\.patch_embeddings\.projection\.", ".patch_embeddings."),
+    (r"\.attention\.attention\.([qkv])\w+\.", r".attention.\1_proj."),
+    (r"\.attention\.output\.dense\.", ".attention.o_proj."),
+    (r"\.weights_in\.", ".(gate|up)_proj."),
+    (r"\.weights_out\.", ".down_proj."),
+)
+
+
+def to_hugging_face(tensors: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the tensors of any source under DINOv3's names in Hugging Face."""
+    tensors = dict(tensors)
+    if "blocks.0.gamma_1" in tensors and not any(n.endswith("_bias") for n in tensors):
+        # Most of timm's models are without the biases, because they are zero.
+        for name in [n for n in tensors if n.endswith(".attn.qkv.weight")]:
+            zeros = np.zeros(np.shape(tensors[name])[:1], np.float32)
+            tensors[name.replace(".weight", ".bias")] = zeros
+    renamed: dict[str, Any] = {}
+    for name, value in tensors.items():
+        mask = tensors.get(f"{name}_mask", np.ones(()))
+        if mask.shape == value.shape:  # otherwise, the bias of the key is unexpected
+            value = to_numpy(value) * to_numpy(mask)
+        for pattern, replacement in (*_DINOV2, *_META_AND_TIMM):
+            name = re.sub(pattern, replacement, name)
+        start, parts, end = (*re.split(r"[()]", name), "", "")[:3]
+        names = [f"{start}{part}{end}" for part in parts.split("|")]
+        values = np.array_split(np.atleast_1d(to_numpy(value)), len(names))
+        renamed |= zip(names, values, strict=True)
+    return renamed
+
+
+# Files -------------------------------------------------------------------------------
 
 
 def load(folder: PathLike) -> tuple[ViT, dict[str, Any]]:
-    """Load model and variables from a folder with `config.json` and `model.safetensors`.
+    """Load model and variables from a download.
 
     Args:
-        folder: Folder such as a download of `facebook/dinov3-vits16-pretrain-lvd1689m`.
+        folder: Folder such as a download of `facebook/dinov3-vits16-pretrain-lvd1689m` or
+            `facebook/dinov2-small`, or a file of Meta or timm; see the module.
 
     Returns:
         The model, and `{"params": ...}` with float32 arrays. For normalized images, the model
@@ -82,12 +157,26 @@ def load(folder: PathLike) -> tuple[ViT, dict[str, Any]]:
     Raises:
         FileNotFoundError: The folder or one of its files is missing.
         DataError: A file is corrupted, or tensors are missing, unexpected or of another
-            shape. The message lists up to 20 of them.
+            shape. The message lists up to 20 of them, with DINOv3's names in Hugging Face.
         UserError: The folder contains another kind of model.
     """
-    folder = files.as_path(folder)
-    path = folder / WEIGHTS_FILE
-    if path.with_name(f"{WEIGHTS_FILE}.index.json").is_file():
+    path, config = files.as_path(folder), {}
+    if not path.is_file():
+        config = _read_config(path)
+        path = path / WEIGHTS_FILE
+    tensors, source = convert.read_state_dict(path, "blocks.0.", "embeddings.")
+    model = model_from_tensors(tensors, source)
+    if "model_type" in config:
+        try:
+            model = model_from_config(config, model)
+        except UserError as error:
+            raise UserError(f"{path.with_name(CONFIG_FILE)}: {error}") from None
+    return model, {"params": to_params(model, tensors, source)}
+
+
+def _read_config(folder: pathlib.Path) -> dict[str, Any]:
+    """Read the config of a model of Hugging Face or timm after checking what it describes."""
+    if (folder / f"{WEIGHTS_FILE}.index.json").is_file():
         raise UserError(
             f"{folder} has its weights in several files: load it with transformers and "
             f"write one {WEIGHTS_FILE} with save_pretrained(..., max_shard_size='100GB')"
@@ -95,22 +184,16 @@ def load(folder: PathLike) -> tuple[ViT, dict[str, Any]]:
     missing = [n for n in (CONFIG_FILE, WEIGHTS_FILE) if not (folder / n).is_file()]
     if missing:
         raise FileNotFoundError(
-            f"{folder} lacks {' and '.join(missing)}: expected a DINOv3 model folder"
-            " as downloaded from Hugging Face"
+            f"{folder} lacks {' and '.join(missing)}: expected a DINOv3 or DINOv2 model "
+            "folder as downloaded from Hugging Face"
         )
     config = files.read_object(folder / CONFIG_FILE)
-    tensors = read_safetensors(path)
-    if any(name.startswith("blocks.") for name in tensors):
-        raise UserError(
-            f"{path} has the names of timm or of Meta's code (blocks.0...), expected those "
-            "of transformers (layer.0...): download the model by facebook, such as "
-            "facebook/dinov3-vits16-pretrain-lvd1689m"
-        )
-    try:
-        model = model_from_config(config)
-    except UserError as error:
-        raise UserError(f"{folder / CONFIG_FILE}: {error}") from None
-    return model, {"params": to_params(model, tensors, str(path))}
+    name = "architecture" if "architecture" in config else "model_type"
+    is_known = re.fullmatch(_KINDS, str(kind := config.get(name))) is not None
+    require(
+        is_known, f"{folder / CONFIG_FILE}: {name}", kind, "a ViT of DINOv3 or DINOv2"
+    )
+    return config
 
 
 def save(model: ViT, params: Mapping[str, Any], folder: PathLike) -> None:
@@ -121,6 +204,7 @@ def save(model: ViT, params: Mapping[str, Any], folder: PathLike) -> None:
         params: Parameters of the model, such as `load(folder)[1]["params"]`.
         folder: Folder, which is created if necessary. Existing files are replaced.
     """
+    require(not model.position_grid, "position_grid", model.position_grid, "0, DINOv3")
     folder = files.as_path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     config = {theirs: getattr(model, ours) for theirs, ours in _FIELDS.items()}
@@ -132,48 +216,69 @@ def save(model: ViT, params: Mapping[str, Any], folder: PathLike) -> None:
         file.write(content)
 
 
-def model_from_config(config: Mapping[str, Any]) -> ViT:
+def model_from_config(config: Mapping[str, Any], sizes: ViT | None = None) -> ViT:
     """Create the model that a Hugging Face `config.json` describes.
 
+    Args:
+        config: Content of the file.
+        sizes: Model whose fields are used where DINOv2's config has none. Not needed for
+            DINOv3.
+
     Raises:
-        UserError: It does not describe a DINOv3 ViT, or a field is missing, of a wrong type,
-            out of range or not supported.
+        UserError: It does not describe a DINOv3 or DINOv2 ViT, or a field is missing, of a
+            wrong type, out of range or not supported.
     """
     constants = _constants(config.get("use_gated_mlp") is True)
+    if sizes is not None and config.get("model_type") != constants["model_type"]:
+        constants = _DINOV2_CONSTANTS
+    elif missing := sorted(set(_FIELDS) - set(config)):
+        raise UserError(f"DINOv3 config lacks {', '.join(missing)}")
     for name, value in constants.items():
         require(config.get(name) == value, name, config.get(name), f"{value!r}")
-    if missing := sorted(set(_FIELDS) - set(config)):
-        raise UserError(f"DINOv3 config lacks {', '.join(missing)}")
-    return ViT(**{ours: config[theirs] for theirs, ours in _FIELDS.items()})
+    fields = {_FIELDS[name]: config[name] for name in _FIELDS if name in config}
+    return (sizes or ViT()).clone(**fields)
 
 
 def model_from_tensors(tensors: Mapping[str, Any], source: str) -> ViT:
-    """Create the model whose sizes are those of DINOv3 tensors by name.
+    """Create the model whose sizes are those of DINOv3 or DINOv2 tensors by name.
 
     Raises:
-        DataError: The tensors are not those of a DINOv3 ViT.
+        DataError: The tensors are not those of a DINOv3 or DINOv2 ViT.
+        UserError: The rotary embedding has other wavelengths, or DINOv2 is from Meta or timm.
     """
+    tensors = to_hugging_face(tensors)
     try:
         hidden, _, patch, _ = tensors["embeddings.patch_embeddings.weight"].shape
         mlp_dim, _ = tensors["layer.0.mlp.up_proj.weight"].shape
-        _, num_registers, _ = tensors["embeddings.register_tokens"].shape
+        none = np.empty((1, 0, hidden))
+        _, num_registers, _ = tensors.get(_REGISTERS, none).shape
+        _, num_positions, _ = tensors.get(_POSITIONS, none).shape
     except (KeyError, ValueError):
         raise DataError(f"{source}: not the tensors of a DINOv3 ViT") from None
+    if "pos_embed" in tensors:
+        raise UserError(f"{source}: DINOv2 is read from its Hugging Face folder")
     layers = {name.split(".")[1] for name in tensors if name.startswith("layer.")}
+    head_dim = 128 if hidden == 4096 else 64  # 128 in the 7B model
+    if (periods := np.ravel(to_numpy(tensors.get(_PERIODS, [])))).size:
+        head_dim = 4 * periods.size
+        expected = 100.0 ** (np.arange(periods.size) / periods.size)
+        if not np.allclose(periods, expected, rtol=0.01):  # may be rounded to bfloat16
+            raise UserError(f"{source}: {_PERIODS} are not powers of 100")
     return ViT(
         hidden_size=hidden,
         num_layers=len(layers),
-        num_heads=hidden // 64,  # 64 channels per head in all but the 7B model
+        num_heads=max(hidden // head_dim, 1),
         mlp_dim=mlp_dim,
         patch_size=patch,
         num_registers=num_registers,
+        position_grid=math.isqrt(max(num_positions - 1, 0)),
         gated_mlp="layer.0.mlp.gate_proj.weight" in tensors,
     )
 
 
 def image_fields(model: ViT) -> dict[str, Any]:
     """Return the fields of `config.model.image` that describe a backbone."""
-    return {name: getattr(model, name) for name in _FIELDS.values()}
+    return {n: getattr(model, n) for n in (*_FIELDS.values(), "position_grid")}
 
 
 def to_params(
@@ -185,16 +290,20 @@ def to_params(
         DataError: Tensors are missing, unexpected or of another shape. The message lists up
             to 20 of them.
     """
-    # transformers 5 adds a prefix to the names of some models.
-    tensors = {name.removeprefix("model."): t for name, t in tensors.items()}
+    tensors = to_hugging_face(tensors)
     # `from_torch` reports a tensor that is missing or has another shape.
     with contextlib.suppress(KeyError, ValueError):
         tokens = [to_numpy(tensors[name]) for name in (_CLASS, _REGISTERS)]
         tensors[_CLASS] = np.concatenate(tokens, 1)
         del tensors[_REGISTERS]
-    # The mask token is only used in pretraining.
-    ignored = r"embeddings\.mask_token$"
-    return from_torch(_RULES, _shapes(model), tensors, source, ignored)["params"]
+    for name in [name for name in tensors if name.endswith(".k_proj.bias")]:
+        if model.position_grid or not np.any(tensors[name]):
+            del tensors[name]  # it has no effect, see `vit.Block`
+    # Only used in pretraining, and checked in `model_from_tensors`.
+    ignored = rf"(embeddings\.)?mask_token$|local_cls_norm\.|{_PERIODS}$|.*\.bias_mask$"
+    return convert.from_torch(_RULES, _shapes(model), tensors, source, ignored)[
+        "params"
+    ]
 
 
 def to_tensors(model: ViT, params: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -202,7 +311,7 @@ def to_tensors(model: ViT, params: Mapping[str, Any]) -> dict[str, np.ndarray]:
     size, params = model.patch_size, dict(params)
     patches = dict(params["patch_embed"])
     patches["kernel"] = np.reshape(patches["kernel"], (size, size, 3, -1))
-    tensors = to_torch(_RULES, {"params": params | {"patch_embed": patches}})
+    tensors = convert.to_torch(_RULES, {"params": params | {"patch_embed": patches}})
     tokens = tensors[_CLASS]
     tensors[_CLASS] = np.ascontiguousarray(tokens[:, :1])
     if model.num_registers:
@@ -215,4 +324,4 @@ def _shapes(model: ViT) -> dict[str, tuple[int, ...]]:
     image = jax.ShapeDtypeStruct(
         (1, model.patch_size, model.patch_size, 3), jnp.float32
     )
-    return shapes_of(jax.eval_shape(model.init, jax.random.key(0), image))
+    return convert.shapes_of(jax.eval_shape(model.init, jax.random.key(0), image))

@@ -1,4 +1,4 @@
-"""Weights of image backbones: DINOv3 from Hugging Face and ResNet-50 from torchvision.
+"""Weights of image backbones: DINOv3, DINOv2, and ResNet-50 from torchvision.
 
 All files are read without torch.
 """
@@ -36,8 +36,8 @@ def load_image_backbone(
     """Load pretrained variables for `radejax.training.step.with_pretrained`.
 
     Args:
-        path: DINOv3 folder from Hugging Face, or ResNet-50 file from torchvision or of
-            `save_resnet`.
+        path: DINOv3 or DINOv2 that `dinov3_hf.load` reads, or ResNet-50 file from
+            torchvision or of `save_resnet`.
         model: Detector, which determines the kind of backbone.
         embeddings_sha256: Checksum of the weights that computed the embeddings, if there
             are any. The frozen parameters are then checked against it and not returned.
@@ -60,8 +60,8 @@ def load_image_backbone(
         if has_camera and model.freeze and not is_embedded:
             raise UserError(
                 "config.model.image.freeze is True, but no weights are given: "
-                "--image-backbone FOLDER (DINOv3 from Hugging Face: config.json and "
-                "model.safetensors; for resnet50 torchvision's .pth file), or train it "
+                "--image-backbone FOLDER (DINOv3 or DINOv2 from Hugging Face: config.json "
+                "and model.safetensors; for resnet50 torchvision's .pth file), or train it "
                 "with --config.model.image.freeze=False"
             )
         return None
@@ -76,7 +76,11 @@ def load_image_backbone(
         vit, variables = dinov3_hf.load(path)
         theirs, ours = map(dinov3_hf.image_fields, (vit, model.vit))
         if lines := differences(theirs, ours, "config.model.image"):
-            raise UserError(f"{path}: another backbone: {'; '.join(lines)}")
+            kind = "DINOv2" if vit.position_grid else "DINOv3"
+            raise UserError(
+                f"{path} is {kind}, another backbone than config.model.image: "
+                f"{'; '.join(lines)} (dinorade:rcw_dinov2 is the config for DINOv2)"
+            )
         part = {"params": {IMAGE_BACKBONE: variables["params"]}}
     if embeddings_sha256 is not None:
         params = dict(part["params"])

@@ -5,8 +5,10 @@ import pathlib
 import click.testing
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 
+import radejax
 from radejax.cli.figures import overlay, viewer_scenes
 from radejax.data.kradar import KRadar
 from radejax.simulation.dataset import default_config, simulate_dataset
@@ -22,7 +24,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     return simulate_dataset(config, folder, progress=False)
 
 
-def _run(name: str, root: pathlib.Path, *arguments: object) -> click.testing.Result:
+def _run(name: str, root: object, *arguments: object) -> click.testing.Result:
     words = [name, "--data", str(root), *map(str, arguments)]
     return click.testing.CliRunner().invoke(overlay, words)
 
@@ -117,3 +119,33 @@ def test_frames_with_projections_only_are_shown(tmp_path: pathlib.Path) -> None:
     (shown,) = viewer_scenes(frames, frames.grid)
     stored = np.load(frames[0].projection_path)
     np.testing.assert_allclose(shown.projection, np.moveaxis(stored, 0, -1))
+
+
+def test_lidar_points_are_drawn_in_the_radar_frame(
+    root: pathlib.Path, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done = _run("1", root, "--lidar", "--out", tmp_path / "lidar.png")
+    assert done.exit_code == 2
+    (frame,) = data = KRadar(root)
+    name = f"os2-64_{frame.header.lidar:05d}.pcd"
+    assert f"frame {frame.key}: no os2-64/{name} in any root" in done.output
+    disk = tmp_path / "disk"  # the scans are on another disk
+    (disk / "1" / "os2-64").mkdir(parents=True)
+    header = "FIELDS x y z intensity\nPOINTS 1\nDATA ascii\n"
+    (disk / "1" / "os2-64" / name).write_text(f"{header}30 2 1 0\n")
+    drawn = []
+
+    def draw(scene: style.Scene) -> Figure:
+        drawn.append(scene.lidar_m)
+        return draw_frame(scene)
+
+    draw_frame = radejax.draw_frame
+    monkeypatch.setattr(radejax, "draw_frame", draw)
+    roots = f"{root},{disk}"
+    done = _run("1", roots, "--lidar", "--out", tmp_path / "lidar.png")
+    assert done.exit_code == 0, done.output
+    np.testing.assert_allclose(drawn[0], [[30 - 2.54, 2 + 0.3, 1]])
+    assert data[0].radar_from_lidar_m[:2] == (-2.54, 0.3)
+    done = _run("1", roots, "--lidar", "--slices", "--out", tmp_path / "lidar.png")
+    assert done.exit_code == 2
+    assert "--slices shows no LiDAR points" in done.output

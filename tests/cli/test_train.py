@@ -81,3 +81,11 @@ def test_fields_are_read_in_every_spelling() -> None:
     fields = context.meta["fields"]
     assert fields == {"seed": "2", "logging.wandb": "true"}
     assert context.params["init_from"] == "a"
+
+
+def test_the_install_page_says_how_to_see_training_curves() -> None:
+    """TensorBoard is not a dependency; runs are written below the folder that it names."""
+    page = pathlib.Path(__file__).parents[2] / "docs" / "install.md"
+    assert "`tensorboard --logdir runs` | `pip install tensorboard`" in page.read_text()
+    (workdir,) = (param for param in train.params if param.name == "workdir")
+    assert "Default: runs/" in workdir.help

@@ -18,6 +18,7 @@ from radejax.data.kradar import KRadar
 from radejax.data.pipeline import (
     LoaderOptions,
     camera_inputs,
+    frame_histories,
     make_loader,
     make_table,
 )
@@ -187,6 +188,71 @@ def test_remainders(loader, batch_size):
     assert not padded[-1].is_valid[empty].any()
 
 
+# Samples of several frames -----------------------------------------------------------
+
+
+def test_preceding_frames_by_hand():
+    keys = ["1/00001_00004", "1/00002_00005", "1/00004_00007", "2/00003_00001"]
+    keys += ["10/00002_00001", "1/00003b"]
+    a, b, d, other, ten, c = keys
+    pairs = frame_histories(reversed(keys), 2)
+    assert pairs == {
+        **{a: (a, a), b: (a, b), c: (b, c), d: (c, d)},
+        **{other: (other, other), ten: (ten, ten)},
+    }
+    # A history ends where a frame is missing.
+    three = frame_histories([a, b, d, "1/00005_00008"], 3)
+    assert three[b] == (a, a, b)
+    assert three[d] == (d, d, d)
+    assert three["1/00005_00008"] == (d, d, "1/00005_00008")
+    # Two names of one radar frame, as two label revisions may give it.
+    twice = frame_histories([a, b, "1/00002_00006"], 2)
+    assert twice[b] == (a, b)
+    assert twice["1/00002_00006"] == (a, "1/00002_00006")
+    with pytest.raises(UserError, match=r"frame 1/x7: .*num_frames=2 needs names that"):
+        frame_histories(["1/x7"], 2)
+
+
+@pytest.mark.parametrize("probability", [0.0, 1.0])
+def test_samples_are_the_records_of_a_frame_and_the_preceding_ones(
+    records, kradar_root, probability, caplog
+):
+    """Also those of another split; all frames of a sample are mirrored."""
+    test = KRadar(kradar_root, split="test", visibility=None)
+    every = KRadar(kradar_root, visibility=None)
+    with caplog.at_level("INFO", "radejax"):
+        table = make_table(records, test, max_objects=5, num_frames=2)
+    augment = Augmentation(records.grid, probability)
+    options = dataclasses.replace(OPTIONS, batch_size=4, num_epochs=1, shuffle=False)
+    options = dataclasses.replace(options, drop_remainder=False, pad_remainder=True)
+    keys, doppler = [frame.key for frame in every], records.grid.num_doppler
+    seen, repeated = 0, 0
+    for batch in make_loader(table, options, augment=augment):
+        chex.assert_shape(batch.projection, (4, 16, 12, 22))
+        assert batch.projection.dtype == np.float16
+        for sample, index in zip(batch.projection, batch.frame, strict=True):
+            if index < 0:
+                assert not sample.any()
+                continue
+            frame, seen = test[index], seen + 1
+            position = keys.index(frame.key)
+            before = every[max(0, position - 1)]
+            if before.sequence != frame.sequence:
+                before = frame
+            repeated += before is frame or position == 0
+            pair = [records[before.key], records[frame.key]]
+            channels = np.concatenate(
+                [x[..., :doppler] for x in pair] + [x[..., doppler:] for x in pair], -1
+            )
+            wanted = channels[:, ::-1] if probability else channels
+            np.testing.assert_array_equal(sample, wanted)
+    assert seen == len(test) < len(every)
+    text = f"{repeated} of {seen} samples of 2 frames repeat one"
+    assert text in caplog.text
+    train = {frame.key for frame in KRadar(kradar_root, split="train")}
+    assert any(before in train for before, _ in table.keys)
+
+
 # State --------------------------------------------------------------------------------
 
 
@@ -346,7 +412,7 @@ def test_table_by_hand(written):
         frame_of("1/c", [BOX], ["Pedestrian"]),
     ]
     table = make_table(written, frames, max_objects=2, classes=("Sedan", "Bicycle"))
-    assert table.keys == ("1/b", "1/a", "1/c")
+    assert table.keys == (("1/b",), ("1/a",), ("1/c",))
     assert table.classes.tolist() == [[1, 0], [-1, -1], [-1, -1]]
     wanted = [10.0, -2.0, 0.5, 4.0, 2.0, 1.5, 0.5, np.sqrt(3) / 2]
     np.testing.assert_allclose(table.boxes[0, 1], wanted, rtol=1e-6)

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from radejax.data.points import cfar_points, local_mean_db
+from radejax.core.errors import DataError
+from radejax.data.points import cfar_points, local_mean_db, read_lidar
 from radejax.data.projection import project_tensor
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -60,3 +61,47 @@ def test_what_is_not_measured_is_zero_or_nan(absent):
     ground = np.array([points.x_m[0], points.y_m[0]])
     ground *= grid.range_m[30] / np.linalg.norm(ground)
     np.testing.assert_allclose(ground, grid.bin_to_ego(30, 5))
+
+
+PCD = """# .PCD v0.7 - Point Cloud Data file format
+VERSION 0.7
+FIELDS x y z intensity t reflectivity ring ambient range
+SIZE 4 4 4 4 4 2 1 2 4
+TYPE F F F F U U U U U
+COUNT 1 1 1 1 1 1 1 1 1
+WIDTH 2
+HEIGHT 2
+VIEWPOINT 0 0 0 1 0 0 0
+POINTS 4
+DATA ascii
+10.5 -2.25 0.125 7 0 1 2 3 10742
+0 0 0 0 0 0 0 0 0
+nan nan nan 0 0 0 0 0 0
+3e1 4 -1.5 7 99 1 63 3 30302
+"""
+
+
+def test_lidar_points_are_read_without_rays_that_have_no_echo(tmp_path):
+    path = tmp_path / "os2-64_00001.pcd"
+    path.write_text(PCD)
+    found = read_lidar(path)
+    np.testing.assert_array_equal(found, [[10.5, -2.25, 0.125], [30.0, 4.0, -1.5]])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("DATA ascii", "DATA binary", "DATA binary, expected FIELDS x y z"),
+        ("FIELDS x y z", "FIELDS intensity x y", "FIELDS intensity x y intensity t"),
+        ("3e1 4 -1.5 7 99 1 63 3 30302\n", "", "3 points, the header says 4"),
+        ("POINTS 4\n", "", "4 points, the header says None"),
+        ("-1.5 7", "up 7", "corrupted, not an ASCII PCD file"),
+        (PCD, "x,y,z\n1,2,3\n", "FIELDS none and DATA none"),
+        (PCD, "\xff\x00" * 50, "os2-64_00001.pcd"),
+    ],
+)
+def test_other_lidar_files_are_named(tmp_path, old, new, message):
+    path = tmp_path / "os2-64_00001.pcd"
+    path.write_bytes(PCD.replace(old, new).encode("latin-1"))
+    with pytest.raises(DataError, match=message):
+        read_lidar(path)

@@ -5,9 +5,11 @@ import types
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from radejax.cli.main import main
 from radejax.core.errors import DataError, UserError
-from radejax.evaluation import boxes, files, kitti
+from radejax.evaluation import boxes, files, kitti, report
 from radejax.evaluation.files import Source
 from radejax.evaluation.results import EvaluationOptions
 
@@ -77,6 +79,93 @@ def test_ground_truth_of_a_report(stored):
             assert a.keys() == b.keys()
             for name in a:
                 np.testing.assert_array_equal(a[name], b[name])
+
+
+def test_options_of_a_report_or_of_the_config_of_a_run(stored, stored_scene):
+    folder, _ = stored
+    run = folder / "run"
+    (run / "boxes").mkdir(parents=True)
+    assert files.stored_options(folder / "found.json") == {}
+    (run / "config.json").write_text('{"classes": ["Sedan", "Tram"], "seed": 1}')
+    for place in (run, run / "boxes", run / "found.json"):
+        assert files.stored_options(place) == {"classes": ("Sedan", "Tram")}
+    options = EvaluationOptions(
+        classes=("Sedan",), roi="wide", score_threshold=0.3, bootstrap=7, plots=False
+    )
+    report.write_report(*stored_scene, run / "evaluation", options)
+    for place in (run, run / "evaluation"):
+        found = EvaluationOptions(**files.stored_options(place))
+        assert found == options
+    assert files.report_folders(run) == {"": run / "evaluation"}
+    assert files.report_folders(run / "boxes") == {"": run / "boxes"}
+
+
+def test_own_classes_need_no_option(stored, write_table):
+    folder, _ = stored
+    run = folder / "run"
+    box = np.array([[20.0, 0, 0, 4, 2, 1.5, 0]])
+    table = {"frame": np.array([0]), "box": box, "cls": np.array(["Tram"])}
+    ids = {"frame": np.array([0])}
+    write_table(run / "found.json", {**table, "score": np.array([0.5])}, ids)
+    write_table(run / "truth.json", table, ids)
+    words = [
+        "score",
+        str(run / "found.json"),
+        "--ground-truth",
+        str(run / "truth.json"),
+    ]
+    words += ["--out", str(folder / "out"), "--protocols", "all_point", "--json"]
+    done = CliRunner().invoke(main, words)
+    assert done.exit_code == 1
+    assert "unknown class 'Tram'" in done.stderr
+    (run / "config.json").write_text('{"classes": ["Tram"]}')
+    done = CliRunner().invoke(main, words)
+    assert done.exit_code == 0, done.stderr
+    row = next(row for row in json.loads(done.stdout)["ap"] if row["cls"] == "Tram")
+    assert row["ap"] == 100
+    # K-Radar's tools have no name for it, which keeps the report that was there.
+    done = CliRunner().invoke(main, [*words, "--kitti"])
+    assert done.exit_code == 2
+    assert "K-Radar's tools have no key for class 'Tram'" in done.stderr
+    assert (folder / "out" / "metrics.json").exists()
+
+
+def test_exported_boxes_are_those_that_count(stored):
+    folder, source = stored
+    options = EvaluationOptions(roi=(0, 15, -3, 3, -2, 6), plots=False, kitti=True)
+    options = dataclasses.replace(options, score_threshold=0.3, classes=("Sedan",))
+    made = files.evaluate_files(folder / "found.json", folder / "out", source, options)
+    place = folder / "out" / "kitti" / "0.3" / "all"
+    truth, found, _ = kitti.read_kitti(place)
+    assert len(truth["frame"]) == made.metrics["num_ground_truth"]
+    assert made.metrics["left_out"][
+        "ground truth: center outside the region of interest"
+    ]
+    assert set(truth["cls"]) == set(found["cls"]) == {"Sedan"}
+    assert found["score"].min() > 0.3
+    # The files give the APs of the report, so that K-Radar's own script does so too.
+    whole = dataclasses.replace(options, roi=None, kitti=False)
+    again = files.evaluate_files(place, folder / "again", Source(), whole)
+    aps = {
+        row.key: row.ap for row in again.results if row.protocol.startswith("kradar")
+    }
+    compared = [
+        row for row in made.results if row.key in aps and row.condition == "all"
+    ]
+    assert len(compared) > 10
+    for row in compared:
+        assert aps[row.key] == pytest.approx(row.ap)
+
+
+def test_figures_are_also_written_as_pdf(stored):
+    folder, source = stored
+    words = ["score", str(folder / "found.json"), "--out", str(folder / "out")]
+    words += ["--ground-truth", source.ground_truth, "--bootstrap", "0"]
+    done = CliRunner().invoke(main, [*words, "--roi", "none", "--figures", "pdf"])
+    assert done.exit_code == 0, done.stderr
+    drawn = sorted(path.name for path in (folder / "out").glob("precision_recall_*"))
+    assert drawn == [f"precision_recall_{space}_iou30.pdf" for space in ("3d", "bev")]
+    assert (folder / "out" / drawn[0]).read_bytes().startswith(b"%PDF")
 
 
 def test_a_part_of_the_frames(stored, random_scene):

@@ -3,6 +3,7 @@ import dataclasses
 import errno
 import json
 import math
+import os
 import re
 import subprocess
 import sys
@@ -44,7 +45,7 @@ def test_report_folder_has_all_files_and_no_temporary_ones(written):
     made, out, drawn = written
     names = {p.name for p in out.iterdir()}
     assert names == {
-        "metrics.json", "metrics.csv", "report.txt", "tables.md", "tables.tex",
+        "metrics.json", "metrics.csv", "report.txt", "tables.md", "tables.tex", "tables",
         "predictions.npz", "ground_truth.npz", "frames.json", "worst_frames",
     }  # fmt: skip
     assert made.folder == out
@@ -115,7 +116,14 @@ def test_tables_include_the_published_rows(written):
     count = latex.count(r"\begin{tabular}")
     assert count == text.count("**") / 2 > 5
     assert latex.count(r"\toprule") == latex.count(r"\end{tabular}") == count
-    assert re.search("% AP .* kradar_r40, score>0, skip=frame", latex)
+    caption = r"\\caption{AP .* kradar\\_r40, score\\ensuremath{>}0, skip=frame"
+    assert re.search(caption, latex)
+    # Each table has a label, and its own file named after it.
+    labels = re.findall(r"\\label{tab:(.*)}", latex)
+    assert len(set(labels)) == count
+    assert {f"{label}.tex" for label in labels} == set(os.listdir(out / "tables"))
+    ablations = out / "tables" / "ablations-sedan-layout-of-table-iii.tex"
+    assert "39.02" in ablations.read_text()
 
 
 def test_invalid_sizes_are_rejected_or_kept_as_false_positives(scene, tmp_path):

@@ -1,48 +1,122 @@
-"""The job script requeues itself after a stop."""
+"""The job script gives srun its resources, and is queued again only after a stop."""
 
 import os
 import pathlib
+import re
+import signal
 import subprocess
+import time
 
 import pytest
 
+from radejax.cli.train import train
+from radejax.core.config import load_config
+
 SCRIPT = pathlib.Path(__file__).resolve().parents[2] / "examples" / "slurm.sh"
+DIRECTIVES = dict(
+    re.findall(r"^#SBATCH --([\w-]+)=(.*)$", SCRIPT.read_text(), re.MULTILINE)
+)
+# Writes its arguments. It ends with `first`, or after SIGTERM with `second`.
+SRUN = """#!/bin/bash
+printf '%s\\n' "$@" > {folder}/arguments
+trap 'exit {second}' TERM
+echo $$ > {folder}/pid
+[ {first} = waits ] || exit {first}
+while :; do sleep 0.05; done
+"""
+SCANCEL = """#!/bin/bash
+echo "$@" >> {folder}/scancel
+kill -TERM "$(cat {folder}/pid)"
+"""
+SCONTROL = """#!/bin/bash
+echo "$@" >> {folder}/scontrol
+"""
+
+
+def _start(folder, first="waits", second=0, arguments=(), **variables):
+    (folder / "bin").mkdir()
+    for name, text in (("srun", SRUN), ("scancel", SCANCEL), ("scontrol", SCONTROL)):
+        path = folder / "bin" / name
+        path.write_text(text.format(folder=folder, first=first, second=second))
+        path.chmod(0o755)
+    return subprocess.Popen(
+        ["bash", SCRIPT, *arguments],
+        env={
+            "PATH": f"{folder}/bin:{os.environ['PATH']}",
+            "DATA": "/disk1,/disk2",
+            "WORKDIR": str(folder / "run"),
+            "SLURM_JOB_ID": "7",
+            "SLURM_CPUS_PER_TASK": DIRECTIVES["cpus-per-task"],
+            **variables,
+        },
+    )
+
+
+def _requeued(folder):
+    path = folder / "scontrol"
+    return path.read_text().splitlines() if path.exists() else []
+
+
+@pytest.mark.parametrize("status", [0, 1, 2, 137, 143])
+@pytest.mark.parametrize("arguments", [(), ("--seeds", "0,1")])
+def test_a_job_that_ends_by_itself_is_not_queued_again(status, arguments, tmp_path):
+    """With seeds and without test frames, the workdir never has an evaluation."""
+    process = _start(tmp_path, first=status, arguments=arguments)
+    assert process.wait(timeout=20) == status
+    assert _requeued(tmp_path) == []
 
 
 @pytest.mark.parametrize(
-    ("status", "is_evaluated", "is_requeued"),
-    [
-        (0, True, False),
-        (0, False, True),  # stopped while training
-        (143, False, True),  # stopped while evaluating
-        (143, True, True),  # ... and drawing
-        (1, False, False),
-        (2, True, False),
-    ],
+    ("status", "is_requeued"), [(0, True), (143, True), (1, False), (2, False)]
 )
-def test_a_slurm_job_goes_back_into_the_queue_where_it_was_stopped(
-    status: int, is_evaluated: bool, is_requeued: bool, tmp_path: pathlib.Path
-) -> None:
-    programs = {
-        "srun": f"#!/bin/sh\nexit {status}\n",
-        "scontrol": f"#!/bin/sh\necho $* > {tmp_path}/requeued\n",
-    }
-    for name, text in programs.items():
-        (tmp_path / name).write_text(text)
-        (tmp_path / name).chmod(0o755)
-    if is_evaluated:
-        (tmp_path / "evaluation").mkdir()
-        (tmp_path / "evaluation" / "metrics.json").touch()
-    ended = subprocess.run(
+def test_a_job_at_its_time_limit_stops_and_is_queued_again(
+    status, is_requeued, tmp_path
+):
+    process = _start(tmp_path, second=status)
+    while not (tmp_path / "pid").exists():
+        time.sleep(0.02)
+    process.send_signal(signal.SIGUSR1)
+    assert process.wait(timeout=20) == status
+    assert (tmp_path / "scancel").read_text() == "--signal=TERM 7\n"
+    assert _requeued(tmp_path) == ["requeue 7"] * is_requeued
+
+
+@pytest.mark.parametrize("config", ["radenet", "dinorade:rc"])
+def test_srun_starts_the_preset_with_all_resources(config, tmp_path):
+    given = {} if config == "radenet" else {"CONFIG": config}
+    extra = ["--seeds", "0,1,2", "--config.train.max_steps=100"]
+    process = _start(tmp_path, first=0, arguments=extra, **given)
+    assert process.wait(timeout=20) == 0
+    words = (tmp_path / "arguments").read_text().splitlines()
+    assert f"--cpus-per-task={DIRECTIVES['cpus-per-task']}" in words
+    start = words.index("radejax")
+    assert words[start : start + 2] == ["radejax", "train"]
+    context = train.make_context("train", words[start + 2 :], resilient_parsing=True)
+    assert context.params["config"] == config
+    assert context.params["roots"] == ("/disk1", "/disk2")
+    assert context.params["records"] == "/disk1/records"
+    assert context.params["seeds"] == (0, 1, 2)
+    assert context.meta["fields"] == {"train.max_steps": "100"}
+
+
+def test_the_directives_agree_with_each_other_and_with_the_preset():
+    """Batch size and precision are those of the config."""
+    count = int(DIRECTIVES["nodes"]) * int(DIRECTIVES["ntasks-per-node"])
+    assert DIRECTIVES["gpus-per-node"] == DIRECTIVES["ntasks-per-node"]
+    for name in ("radenet", "dinorade"):
+        assert load_config(name).train.batch_size % count == 0
+    text = SCRIPT.read_text()
+    assert "--config." not in text
+    assert DIRECTIVES["signal"].startswith("B:USR1@")
+    assert "trap stop USR1" in text
+
+
+def test_a_job_without_data_says_what_is_missing(tmp_path):
+    done = subprocess.run(
         ["bash", SCRIPT],
-        env={
-            "PATH": f"{tmp_path}:{os.environ['PATH']}",
-            "DATA": "d",
-            "WORKDIR": str(tmp_path),
-            "SLURM_JOB_ID": "7",
-        },
+        env={"PATH": os.environ["PATH"]},
+        capture_output=True,
+        text=True,
     )
-    assert ended.returncode == status
-    assert (tmp_path / "requeued").exists() == is_requeued
-    if is_requeued:
-        assert (tmp_path / "requeued").read_text() == "requeue 7\n"
+    assert done.returncode != 0
+    assert "DATA: folders of K-Radar, separated by commas" in done.stderr

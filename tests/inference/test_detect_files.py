@@ -125,6 +125,33 @@ def test_boxes_of_an_exported_folder(tmp_path):
         load_model(tmp_path / "packed", step="best")
 
 
+def test_preceding_frames_of_files_are_of_their_sequence(tmp_path):
+    """Frames 7, 8 and 10 of a sequence, and 11 of the next one."""
+    detector = small.detector(num_frames=2, batch_sizes=(2,))
+    save_model(detector.saved, tmp_path / "packed")
+    names = ("1/DERA_tesseract/DERA_tesseract_00007.npy",)
+    names += ("1/DERA_tesseract/DERA_tesseract_00008.npy",)
+    names += ("1/DERA_tesseract/DERA_tesseract_00010.npy",)
+    names += ("2/DERA_tesseract/DERA_tesseract_00011.npy",)
+    frames = small.projections(4)
+    for name, frame in zip(names, frames, strict=True):
+        path = tmp_path / "data" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.save(path, np.moveaxis(frame, -1, 0))
+    expected = detector(np.stack([frames[[0, 0, 2, 3]], frames], 1)).to_list()
+    for batch_size in (1, 2, 8):
+        out = tmp_path / f"out{batch_size}"
+        count = detect_files(
+            tmp_path / "packed", [tmp_path / "data"], out, batch_size=batch_size
+        )
+        assert (count["frames"], count["repeated"]) == (4, 3)
+        for path, boxes in zip(sorted(out.iterdir()), expected, strict=True):
+            found = json.loads(path.read_text())
+            assert [b["score"] for b in found] == pytest.approx(
+                [b["score"] for b in boxes], abs=1e-5
+            )
+
+
 def test_two_frames_of_one_name_are_rejected(tmp_path):
     for disk in ("a", "b"):
         path = tmp_path / disk / "5" / "radar_tesseract" / "tesseract_00033.mat"

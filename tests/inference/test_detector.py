@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from radejax import Detector, UserError
-from radejax.core.structures import CLASSES, NARROW_ROI
+from radejax.core.structures import CLASSES, NARROW_ROI, Batch
 from radejax.data.kradar import write
 from radejax.data.projection import project_tensor
 from radejax.evaluation.kitti import prediction_texts
@@ -90,6 +90,53 @@ def test_stream_gives_what_calls_give(detector, projections):
     assert len(streamed) == 5
     for found, projection in zip(streamed, projections, strict=True):
         _equal(found, detector(projection))
+
+
+def test_samples_of_two_frames_and_a_stream_with_a_history(
+    detector, tesseracts, projections, tmp_path
+):
+    two = small.detector(num_frames=2, score_threshold=0.3, batch_sizes=(1, 4))
+    pairs = np.stack([projections[[0, 0, 1, 2, 3]], projections], 1)
+    expected = two(pairs)
+    assert expected.boxes.shape == (5, 100, 7)
+    # A sample is what the loader makes of its frames; their order matters.
+    doppler = two.grid.num_doppler
+    parts = [pairs[..., :doppler], pairs[..., doppler:]]
+    stacked = np.concatenate([p[:, i] for p in parts for i in (0, 1)], -1)
+    zeros = np.zeros((5, 0), np.int32)
+    batch = Batch(
+        *(stacked, np.zeros((5, 0, 8), np.float32), zeros, zeros > 0, zeros.sum(1))
+    )
+    _equal(two(batch), expected)
+    assert np.abs(two(pairs[:, ::-1]).scores - expected.scores).max() > 1e-3
+    # Arrays and paths of one sample, tesseracts and projections.
+    _equal(two(list(projections[:2])), two(pairs[1]))
+    _equal(two(tesseracts[:2]), two(pairs[1]))
+    _equal(two(np.stack([tesseracts[:2]] * 2)), two(pairs[[1, 1]]))
+    paths = [tmp_path / f"tesseract_{i:05d}.mat" for i in (1, 2)]
+    for path, tesseract in zip(paths, tesseracts, strict=False):
+        write.write_tesseract(path, tesseract)
+    _equal(two(paths), two(pairs[1]))
+    # The stream takes single frames or batches of them.
+    items = (projections[0], tesseracts[1:4], list(projections[4:]))
+    streamed = list(two.stream(items))
+    whole = jax.tree.map(lambda *x: np.concatenate(x), *streamed)
+    _equal(whole, expected)
+    assert two.warmup(2) is two
+    with pytest.raises(
+        UserError,
+        match=r"\[16, 14, 5\]; expected .*\[B, 2, R, A, D\+E\].* of 2 consecutive "
+        r"frames \(config.data.num_frames\), oldest first; Detector.stream takes",
+    ):
+        two(projections[0])
+
+
+def test_a_stream_of_samples_counts_every_invalid_frame_once():
+    two = small.detector(num_frames=3, batch_sizes=(1, 4))
+    frames = small.projections(4)
+    frames[1, 0, 0, 0] = np.nan
+    assert len(list(two.stream([frames[:2], frames[2:]]))) == 2
+    assert two.num_invalid_frames == 1
 
 
 def test_detections_as_columns_lists_and_text(detector, projections):

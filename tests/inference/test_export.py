@@ -124,6 +124,24 @@ def test_a_fresh_process_without_radejax_finds_the_same_boxes(tmp_path):
     _check(found, "3", again(projection))
 
 
+def test_a_program_of_two_frames_takes_the_channels_of_both(tmp_path):
+    detector = small.detector(num_frames=2)
+    export.export(detector, tmp_path, platforms=("cpu",))
+    rows = json.loads((tmp_path / "inputs.json").read_text())
+    assert rows[-4]["shape"] == [None, 16, 14, 10]
+    assert "Projections [B, 16, 14, 10] float32" in (tmp_path / "README.md").read_text()
+    frames = small.projections(2)
+    parts = [frames[..., :2], frames[..., 2:]]
+    stacked = np.concatenate([part[i] for part in parts for i in (0, 1)], -1)
+    detect = exported_loader.load(tmp_path)
+    found = {f"{name}_1": x for name, x in detect(stacked[None]).items()}
+    again = Detector.from_workdir(tmp_path)
+    assert again.num_frames == 2
+    _check(found, "1", again(frames))
+    with pytest.raises(UserError, match=r"input is 'tensor', expected projection, as"):
+        export.export(detector, tmp_path, radar_input="tensor")
+
+
 def test_a_program_of_one_batch_size_and_platform_has_static_shapes(tmp_path):
     detector = small.detector()
     export.export(detector, tmp_path, platforms=("cpu",), batch_size=2)

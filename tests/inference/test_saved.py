@@ -156,6 +156,19 @@ def test_an_exported_radar_model_gives_the_same_boxes(tmp_path):
     assert load_model(tmp_path).config.to_json() == detector.saved.config.to_json()
 
 
+def test_a_model_of_a_version_without_several_frames_opens(tmp_path):
+    model = small.saved()
+    expected = Detector(model, batch_sizes=(4,))(small.projections(3))
+    with model.config.unlocked():
+        del model.config.data.num_frames
+    save_model(model, tmp_path)
+    assert "num_frames" not in (tmp_path / "config.json").read_text()
+    _equal(
+        Detector.from_workdir(tmp_path, batch_sizes=(4,))(small.projections(3)),
+        expected,
+    )
+
+
 def test_weights_that_are_not_finite_are_an_error(tmp_path):
     model = small.saved()
     params = jax.tree.map(np.array, model.variables["params"])

@@ -12,6 +12,7 @@ import pytest
 
 from radejax.core.config import load_module
 from radejax.core.errors import UserError
+from radejax.data.projection import stack_frames
 from radejax.geometry.camera import stack_cameras
 from radejax.models import build, lifting
 from radejax.models.lifting import ReferencePoints
@@ -81,6 +82,31 @@ def test_radar_parts_have_the_names_of_radenet():
     chex.assert_trees_all_equal_shapes(ours, shapes)
 
 
+def test_elevation_weights_are_those_of_the_last_frame():
+    detector = small_models.detector("camera", num_frames=2)
+    model, variables = detector.model, detector.variables
+    image = jnp.asarray(small_models.images(1))
+    camera = stack_cameras([calibration().camera()])
+
+    @jax.jit
+    def apply(stacked):
+        inputs = stacked[None], image, camera
+        _, found = model.apply(variables, *inputs, capture_intermediates=True)
+        found = found["intermediates"]
+        weights = found["image_fusion"]["weighting"]["__call__"][0]
+        return weights, found["backbone"]["__call__"][0]
+
+    def weighting(*frames):
+        return apply(stack_frames(frames, model.doppler_bins))
+
+    a, b, c = small_models.projections(3)
+    weights, features = weighting(a, b)
+    other_weights, other_features = weighting(c, b)
+    np.testing.assert_array_equal(weights, other_weights)
+    assert np.abs(features - other_features).max() > 1e-3
+    assert np.abs(weighting(a, c)[0] - weights).max() > 1e-3
+
+
 def test_the_camera_changes_the_prediction_and_each_frame_uses_its_own():
     _, variables = model_and_variables()
     projection, image, camera = batch()
@@ -108,6 +134,34 @@ def test_embedded_images_give_the_same_prediction():
     )
     from_images = applied()(variables, projection, image, camera)
     chex.assert_trees_all_close(from_features, from_images, atol=2e-6)
+
+
+def test_a_query_samples_the_same_place_of_an_image_that_is_resized():
+    # 32 x 48 pixels are resized to 28 x 42 for patches of 14 pixels.
+    model = small(**{"image.patch_size": 14, "image.position_grid": 4})
+    assert model.feature_shape == (2, 3, 16)
+    own = calibration()
+    point = np.array([[12.0, 1.0, 0.5]])
+    pixels, _ = own.project_ego(point)
+    scaled, _ = own.resized(42, 28).project_ego(point)
+    np.testing.assert_allclose(scaled, pixels * 28 / 32, rtol=1e-12)
+    # Reference points are fractions of the image, so that those of both cameras are equal.
+    reference, other = (
+        lifting.reference_points(one.camera(), model.query_grid, 8, 8)
+        for one in (own, own.resized(42, 28))
+    )
+    chex.assert_trees_all_close(reference, other, atol=1e-7)
+    assert 0.05 < reference.is_valid.mean() < 0.95
+    # Pixels (28..31, 14..15) belong to the patch in row 0 and column 1: without resizing,
+    # they would be in row 1 and column 2.
+    variables = drawn(model, *batch())
+    backbone = {"params": {"image_backbone": variables["params"]["image_backbone"]}}
+    embed = jax.jit(functools.partial(model.apply, method="embed"))
+    image = np.zeros((1, *SIZE, 3), np.uint8)
+    before = embed(backbone, image)
+    image[:, 14:16, 28:32] = 255
+    change = np.abs(embed(backbone, image) - before)[0].sum(-1)
+    assert np.unravel_index(change.argmax(), change.shape) == (0, 1)
 
 
 def test_reference_points_computed_before_give_the_same_prediction():
@@ -256,7 +310,11 @@ def test_images_of_another_size_are_rejected():
     [
         ({"fusion.depth": 3}, r"config.model.fusion.depth is not a field"),
         ({"query_grid": {}}, r"config.model.query_grid.azimuth_deg is missing"),
-        ({"image.size": (30, 48)}, r"image.size is \(30, 48\), .* multiples of 16"),
+        ({"image.size": (8, 48)}, r"image.size is \(8, 48\), .* at least 16 pixels"),
+        (
+            {"image.kind": "resnet50", "image.size": (30, 48)},
+            r"image.size is \(30, 48\), .* multiples of 16",
+        ),
         ({"image.hidden_size": 20}, r"hidden_size is 20, .* multiple of 4 .* 2 heads"),
         ({"fusion.num_heads": 3}, r"fusion.num_heads is 3, expected a divisor"),
         (

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import traverse_util
 from ml_collections import ConfigDict
 
 from radejax import models
@@ -145,6 +146,27 @@ def test_cbam_kinds_give_their_parameters(small):
 def test_wrong_channels_are_named(small):
     with pytest.raises(ValueError, match=r"\[B, R, A, 13\].*got \(1, 8, 8, 12\)"):
         models.build(small).init(jax.random.key(0), jnp.zeros((1, 8, 8, 12)))
+
+
+def test_two_frames_have_twice_the_channels_of_the_first_convolution_only(small):
+    def shapes(num_frames, **changes):
+        model = models.build(small | changes, num_frames)
+        x = jnp.zeros((1, 8, 8, 13 * num_frames))
+        params = jax.eval_shape(model.init, jax.random.key(0), x)["params"]
+        flat = traverse_util.flatten_dict(params, sep="/")
+        return {name: leaf.shape for name, leaf in flat.items()}
+
+    for changes in ({}, {"input_stem": True}):
+        one, two = shapes(1, **changes), shapes(2, **changes)
+        other = {name: (one[name], two[name]) for name in one if one[name] != two[name]}
+        bins = models.build(small).doppler_bins
+        expected = [13] if not changes else [bins, 13 - bins]
+        assert [(a[-2], b[-2]) for a, b in other.values()] == [
+            (n, 2 * n) for n in expected
+        ]
+        assert one.keys() == two.keys()
+    with pytest.raises(UserError, match=r"\[B, R, A, 26\] .* got \(1, 8, 8, 13\)"):
+        models.build(small, 2).init(jax.random.key(0), jnp.zeros((1, 8, 8, 13)))
 
 
 def test_build_takes_a_config_dict(small):

@@ -53,6 +53,8 @@ WRONG = [
     ("decode.max_detections", 0),
     ("train.batch_size", 0),
     ("train.num_epochs", 0),
+    ("train.max_steps", 0),
+    ("train.max_steps", 1.5),
     ("train.learning_rate", 0.0),
     ("train.final_learning_rate", 1.0),
     ("train.gradient_clip_norm", 0.0),

@@ -105,11 +105,20 @@ def test_changes_replace_what_the_config_says() -> None:
 @pytest.mark.parametrize(
     ("choosing", "split", "step", "folder", "remark"),
     [
-        ("test", "test", "best", "evaluation", "chosen on the test split"),
+        (
+            "test",
+            "test",
+            "best",
+            "evaluation_checkpoint_best",
+            "chosen on the test split",
+        ),
         ("test", "test", None, "evaluation", ""),
-        ("validation", "test", "best", "evaluation", ""),
+        ("validation", "test", "best", "evaluation_checkpoint_best", ""),
         ("validation", "validation", None, "evaluation_validation", ""),
-        ("validation", "all", "best", "evaluation", "chosen on the validation split"),
+        (
+            *("validation", "all", "best", "evaluation_all_checkpoint_best"),
+            "chosen on the validation split",
+        ),
     ],
 )
 def test_numbers_on_what_chose_the_checkpoint_are_marked(
@@ -137,6 +146,40 @@ def test_numbers_on_what_chose_the_checkpoint_are_marked(
     assert ("may not be reported" in caplog.text) == bool(remark)
 
 
+@pytest.mark.parametrize(
+    ("changes", "folder"),
+    [
+        ({}, "evaluation"),
+        ({"bootstrap": 7, "figures": "pdf", "min_score": 0.05}, "evaluation"),
+        ({"roi": "wide", "step": 70}, "evaluation_checkpoint_70_roi_wide"),
+        ({"roi": None}, "evaluation_roi_None"),
+        (
+            {"classes": ("Sedan", "Bus or Truck"), "score_threshold": 0.1},
+            "evaluation_classes_Sedan_Bus-or-Truck_score_threshold_0.1",
+        ),
+        ({"split": "lists/fog.txt"}, "evaluation_fog"),
+        ({"out": "elsewhere", "roi": "wide"}, "elsewhere"),
+    ],
+)
+def test_other_options_have_another_folder(
+    changes: dict[str, Any],
+    folder: str,
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    written: list[pathlib.Path] = []
+    data = SimpleNamespace(choosing_split="test", preprocess=lambda: None)
+    loaded = SimpleNamespace(config=_config(), run="run", variables=None, step=3)
+    monkeypatch.setattr(evaluate, "load_model", lambda *_, **__: loaded)
+    monkeypatch.setattr(evaluate, "data_of_run", lambda *_: (loaded.config, data))
+    evaluation = SimpleNamespace(report=lambda *_, out, **__: written.append(out))
+    monkeypatch.setattr(evaluate, "Evaluation", lambda *_, **__: evaluation)
+    if "out" in changes:
+        changes = {**changes, "out": tmp_path / changes["out"]}
+    evaluate.evaluate_run(tmp_path, **changes)
+    assert written == [tmp_path / folder]
+
+
 @pytest.mark.parametrize("is_simulated", [True, False])
 def test_titles_of_scenes_say_whether_they_are_simulated(
     is_simulated: bool, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
@@ -149,12 +192,16 @@ def test_titles_of_scenes_say_whether_they_are_simulated(
     titles: list[str] = []
     (tmp_path / "figures").mkdir()
     monkeypatch.setattr(evaluate, "draw_scenes", titles.extend)
-    monkeypatch.setattr(evaluate, "save_figure", lambda *_: None)
+    saved: list[str] = []
+    monkeypatch.setattr(
+        evaluate, "save_figure", lambda _, path: saved.append(path.name)
+    )
     evaluation: Any = SimpleNamespace(
         _frames=frames,
-        _options=SimpleNamespace(num_visualizations=1),
+        _options=SimpleNamespace(num_visualizations=1, figures="pdf"),
         _figures=lambda *_: [],
         _scene=lambda _, __, title: title,
     )
     evaluate.Evaluation._write_figures(evaluation, {}, tmp_path, tmp_path)
+    assert saved == ["scenes.pdf"]
     assert titles == [f"fog (1/00033_00001){', simulated' if is_simulated else ''}"]

@@ -12,7 +12,8 @@ from radejax.core.config import base_config, load_config
 from radejax.core.errors import UserError
 from radejax.data.kradar import dataset
 from radejax.detection.decode import DecodeOptions
-from radejax.inference.saved import StartingWeights
+from radejax.inference.detect_files import detect_files
+from radejax.inference.saved import StartingWeights, load_model
 from radejax.runs import evaluate, experiment
 from radejax.runs.experiment import claimed
 from radejax.simulation.dataset import default_config, simulate_dataset
@@ -107,6 +108,8 @@ def test_labels_are_read_once(
         config.data.roots = (str(tmp_path / "data"),)
         folder = experiment.run(config, tmp_path / "run")
     assert evaluated == [[2, 2], [4, 4]]
+    (events,) = (folder / "tensorboard").glob("*.test")
+    assert b"test/map_3d_iou30/coco101/" in events.read_bytes()
     frames = json.loads((folder / "evaluation" / "frames.json").read_text())
     assert (frames["sequence"], frames["split"]) == ([4, 4], ["test", "test"])
     assert "Best checkpoint, chosen on the validation split: " in caplog.text
@@ -115,6 +118,40 @@ def test_labels_are_read_once(
         assert info["same"]["frames to train on"] == 4
     assert len(parsed) == 8
     assert set(parsed.values()) == {1}
+
+
+@pytest.mark.usefixtures("one_device")
+def test_a_run_of_two_frames(
+    tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Training, evaluation and detection; weights fit models of two frames only."""
+    config = load_config(f"{CONFIGS / 'quickstart.py'}:short")
+    config.simulation.update(
+        train_sequences=2, frames_per_sequence=3, output="projection"
+    )
+    config = small.shrink_run(config)
+    config.data.update(num_frames=2, roots=(str(tmp_path / "data"),))
+    config.model.update(cbam="off", widths=(8,), input_stem=True)
+    config.train.num_epochs = 1
+    config.evaluation.num_visualizations = 0
+    with caplog.at_level("INFO", "radejax"):
+        folder = experiment.run(config, tmp_path / "run")
+    assert "2 of 6 samples of 2 frames repeat one" in caplog.text
+    assert "1 of 3 samples of 2 frames repeat one" in caplog.text
+    saved = load_model(folder)
+    kernel = saved.variables["params"]["backbone"]["stem"]["doppler"]["conv"]["kernel"]
+    assert kernel.shape[-2] == 2 * 4
+    assert len(list((tmp_path / "data" / "records").glob("*/*.npy"))) == 9
+    root, out = tmp_path / "data", tmp_path / "boxes"
+    count = detect_files(folder, [root], out, score_threshold=0.0)
+    assert (count["frames"], count["repeated"]) == (9, 3)
+    config.data.num_frames = 1
+    with pytest.raises(UserError, match=r"run do not fit config.model .*stem/doppler"):
+        experiment.run(config, tmp_path / "one", init_from=folder)
+    config.data.update(num_frames=2, roots=(str(tmp_path / "single"),))
+    config.simulation.update(train_sequences=4, frames_per_sequence=1)
+    with pytest.raises(UserError, match=r"num_frames is 2, expected 1, as no frame to"):
+        experiment.run(config, tmp_path / "single_run")
 
 
 # Work folders ------------------------------------------------------------------------
@@ -179,10 +216,10 @@ def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
         seen.append((config.seed, workdir.name, init_from))
         (workdir / "evaluation").mkdir(parents=True)
         (workdir / "evaluation" / "metrics.csv").write_text(
-            "protocol,condition,cls,space,iou,ap,num_gt\n"
-            + f"all_point,all,Sedan,3d,0.3,{aps[config.seed]},10\n"
-            + "all_point,all,Bicycle,3d,0.3,,0\n"
-            + f"all_point,rain,Sedan,3d,0.3,{config.seed},3\n"
+            "name,protocol,score_threshold,condition,cls,space,iou,ap,num_gt\n"
+            + f"a/simulated,all_point,0.05,all,Sedan,3d,0.3,{aps[config.seed]},10\n"
+            + "b/simulated,all_point,0.05,all,Bicycle,3d,0.3,,0\n"
+            + f"c/simulated,all_point,0.05,rain,Sedan,3d,0.3,{config.seed},3\n"
         )
         return workdir
 
@@ -196,8 +233,11 @@ def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
     assert rows[0]["std"] == pytest.approx(21**0.5)  # (16 + 1 + 25) / 2
     assert rows[0]["values"] == {"0": 50.0, "1": 53.0, "2": 59.0}
     text = (tmp_path / "runs" / "seeds.txt").read_text()
-    assert "54.00" in text
-    assert "4.58" in text
+    assert text.startswith("Simulated data: AP, mean ± standard deviation over 3 seeds")
+    for ending in ("txt", "md", "tex"):
+        table = (tmp_path / "runs" / f"seeds.{ending}").read_text()
+        assert "54.00 ± 4.58" in table
+    assert "all_point, score>0.05" in text
     assert "rain" not in text
 
 

@@ -7,6 +7,7 @@ import pathlib
 import signal
 from collections.abc import Iterator
 from typing import Any
+from unittest import mock
 
 import chex
 import grain
@@ -20,6 +21,7 @@ from radejax.core.errors import DataError, UserError
 from radejax.training import distributed, loop
 from radejax.training.checkpoints import Checkpoints
 from radejax.training.metric_logger import Scores
+from radejax.training.step import make_schedule
 
 Tiny = Any  # the fixture `tiny` of conftest.py
 STEPS_PER_EPOCH = 4
@@ -32,6 +34,7 @@ def compiled_once() -> Iterator[None]:
     Runs differ in what happens around their steps, and tracing takes the longest.
     """
     fields = ("learning_rate", "final_learning_rate", "warmup_steps", "num_epochs")
+    fields = (*fields, "max_steps")
 
     def key(x: Any) -> Any:
         if isinstance(x, ConfigDict):
@@ -132,6 +135,22 @@ def test_a_run_ends_after_its_epochs_and_learns(undisturbed: Any) -> None:
     losses = _losses(folder)
     assert [step for step, _ in losses] == list(range(1, 9))
     assert losses[-1][1] < losses[0][1]
+
+
+@pytest.mark.parametrize(("max_steps", "expected"), [(5, 5), (20, 8)])
+def test_a_run_ends_after_the_given_steps(
+    run: Any, tiny: Tiny, tmp_path: pathlib.Path, max_steps: int, expected: int
+) -> None:
+    config = tiny.config.copy_and_resolve_references()
+    config.train.update(max_steps=max_steps, evaluate_every_epochs=1)
+    evaluate = mock.Mock(return_value=Scores({}, best=1.0))
+    state, is_finished = run(tmp_path, config=config, evaluate=evaluate)
+    assert is_finished
+    assert state.step == expected
+    assert evaluate.call_count == 2  # after the first epoch and at the end
+    again, is_finished = run(tmp_path, config=config)  # there is nothing left to do
+    assert is_finished
+    chex.assert_trees_all_equal(again, state)
 
 
 @pytest.mark.slow
@@ -335,8 +354,13 @@ def test_evaluation_on_the_way_is_logged_and_the_best_kept(
 
     run(workdir, config=config, evaluate=evaluate, steps_per_epoch=2)
     rows = map(json.loads, (workdir / "metrics.jsonl").read_text().splitlines())
+    rows = list(rows)
     name = "validation/ap_bev_iou30/exact"
     assert [row[name] for row in rows if name in row] == [1.5, 3.5, 2.5, 2.0]
+    schedule = make_schedule(config.train, 2)
+    rates = {row["step"]: row["learning_rate"] for row in rows if "focal" in row}
+    assert rates == {step: pytest.approx(float(schedule(step - 1))) for step in rates}
+    assert len(set(rates.values())) > 1
     with Checkpoints(workdir / "checkpoints", read_only=True) as checkpoints:
         assert checkpoints.steps() == [4, 8]
         assert checkpoints.best_step() == 4

@@ -6,13 +6,14 @@ import pathlib
 import sys
 from unittest import mock
 
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
 from radejax.core.config import base_config
 from radejax.core.errors import DiskFullError, UserError
 from radejax.training import distributed
-from radejax.training.metric_logger import MetricLogger, Scores
+from radejax.training.metric_logger import MetricLogger, Scores, log_results
 
 
 def _steps(folder: pathlib.Path) -> list[int]:
@@ -42,6 +43,19 @@ def test_records_after_the_restored_step_are_written_anew(
     assert last["focal"] == 60.0
     assert last["frames_per_s"] > 0
     assert 0 <= last["data_wait_share"] <= 1
+
+
+def test_the_final_results_are_in_tensorboard(tmp_path: pathlib.Path) -> None:
+    with _logger(tmp_path, 0) as logger:
+        logger.log(1, {"focal": 1.0}, epoch=1.0)
+    log_results(tmp_path, 1, {"map_3d_iou30/coco101": 61.0})
+    first, last = sorted((tmp_path / "tensorboard").iterdir(), key=lambda x: x.suffix)[
+        ::-1
+    ]
+    both = {path.suffix: path.read_bytes() for path in (first, last)}
+    (final,) = (text for suffix, text in both.items() if suffix == ".test")
+    assert b"test/map_3d_iou30/coco101" in final
+    assert np.float32(61).tobytes() in final
 
 
 def test_other_processes_write_nothing(

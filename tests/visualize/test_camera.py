@@ -120,3 +120,11 @@ def test_far_boxes_get_no_label():
     ax = drawn([far, BOX], ("Sedan", "Bicycle"))
     assert texts_of(ax) == ["Bicycle"]
     assert len(segments_of(ax)) == 24
+
+
+def test_lidar_points_in_the_image_are_drawn():
+    points_m = np.array([[10.0, 1.0, 0.5], [-10.0, 0, 0], [10.0, 90.0, 0]])
+    ax = camera.draw_camera(IMAGE, CALIBRATION, lidar_m=points_m)
+    (scatter,) = ax.collections
+    # u = 64 - 100 / 10, v = 36 - 50 / 10; the others are behind the camera or beside it.
+    np.testing.assert_allclose(scatter.get_offsets(), [[53.5, 30.5]])

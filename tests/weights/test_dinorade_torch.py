@@ -23,6 +23,7 @@ from radejax.models.lifting import (
     WeightingNetwork,
     reference_points,
 )
+from radejax.models.vit import ViT
 from radejax.weights import dinorade_torch, dinov3_hf
 from radejax.weights.convert import (
     from_torch,
@@ -222,6 +223,13 @@ def test_a_folder_in_place_of_the_backbone(tiny, make, tmp_path):
     assert loaded.model.vit == vit
     found = loaded.variables["params"]["image_backbone"]
     chex.assert_trees_all_equal(found, expected["params"])
+
+
+def test_dinov2_in_place_of_the_backbone_is_rejected(tiny, monkeypatch):
+    vit = ViT(patch_size=14, position_grid=37)
+    monkeypatch.setattr(dinov3_hf, "load", lambda path: (vit, {"params": {}}))
+    with pytest.raises(UserError, match="folder is 'DINOv2', expected DINOv3 as in"):
+        dinorade_torch.load(tiny, dinov3="folder")
 
 
 def test_other_content_is_rejected(shared, tmp_path):

@@ -9,10 +9,17 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
+from radejax.core.config import load_module
 from radejax.core.errors import DataError, UserError
 from radejax.weights import dinov3_hf
 
+from ..torch_files import write_pth
+
 TOLERANCE = 5e-5
+SOURCES = [
+    *("meta", "meta_swiglu", "timm", "timm_qkvb", "timm_swiglu"),
+    *("dinov2", "dinov2_swiglu", "dinov2_registers"),
+]
 
 
 @pytest.fixture(scope="module")
@@ -144,7 +151,7 @@ def test_incomplete_or_corrupted_folders(folder, tmp_path):
     safetensors.numpy.save_file(
         {"blocks.0.attn.qkv.weight": np.zeros((3, 1), np.float32)}, weights
     )
-    with pytest.raises(UserError, match="has the names of timm or of Meta's code"):
+    with pytest.raises(DataError, match="not the tensors of a DINOv3 ViT"):
         dinov3_hf.load(folder)
     (folder / "config.json").write_text("[1]")
     with pytest.raises(DataError, match=r"config.json: expected a JSON object"):
@@ -187,3 +194,166 @@ def test_another_number_of_layers_is_rejected(make, tensors, count, message):
     model = dinov3_hf.model_from_config(make.TINY_CONFIG | {"num_hidden_layers": count})
     with pytest.raises(DataError, match=f"x does not fit, .*{message}"):
         dinov3_hf.to_params(model, tensors, "x")
+
+
+# Other sources -----------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def sources(golden):
+    """Seeds, names and features of the tiny models of all sources."""
+    return load_module(golden / "backbones_make.py"), dict(
+        np.load(golden / "backbones.npz")
+    )
+
+
+def description(sources, name):
+    """Tensors and config of a tiny model."""
+    seeds, arrays = sources
+    info = json.loads(str(arrays["info"]))[name]
+    return seeds.tensors(info["tensors"]), info["config"]
+
+
+def write(folder, name, tensors, config):
+    """Write a model as its source does, and return the path to load."""
+    folder.mkdir(exist_ok=True)
+    if name.startswith("meta"):
+        write_pth(folder / "dinov3.pth", tensors)
+        return folder / "dinov3.pth"
+    (folder / "config.json").write_text(json.dumps(config))
+    safetensors.numpy.save_file(tensors, folder / "model.safetensors")
+    return folder
+
+
+@pytest.mark.parametrize("name", SOURCES)
+def test_features_of_the_original_code(sources, name, tmp_path):
+    seeds, arrays = sources
+    tensors, config = description(sources, name)
+    path = write(tmp_path, name, tensors, config)
+    model, variables = dinov3_hf.load(path)
+    assert model.gated_mlp == ("swiglu" in name)
+    assert model.position_grid == (4 if "dinov2" in name else 0)
+    sizes = [key.split("__")[1] for key in arrays if key.startswith(f"{name}__")]
+    assert len(sizes) == (3 if "dinov2" in name else 2)
+    for size in sizes:
+        image = seeds.image(*map(int, size.split("x"))).transpose(0, 2, 3, 1)
+        tokens = jax.jit(model.apply)(variables, image)[0, :, ::4]
+        np.testing.assert_allclose(tokens, arrays[f"{name}__{size}"], atol=1.5e-5)
+    if name.startswith("timm"):  # the file without its folder
+        again = dinov3_hf.load(path / "model.safetensors")
+        chex.assert_trees_all_equal(again[1], variables)
+
+
+@pytest.mark.parametrize("name", ["meta", "timm_qkvb", "dinov2_registers"])
+def test_missing_and_unexpected_tensors(sources, name, tmp_path):
+    tensors, config = description(sources, name)
+    norm = {"meta": "blocks.1.norm2.bias", "timm_qkvb": "blocks.1.norm2.bias"}.get(
+        name, "encoder.layer.1.norm2.bias"
+    )
+    registers = next(n for n in tensors if "reg" in n or "storage" in n)
+    del tensors[norm]
+    tensors["head.weight"] = tensors.pop(registers)
+    path = write(tmp_path, name, tensors, config)
+    with pytest.raises(DataError, match=r"missing layer\.1\.norm2\.bias; unexp.*head"):
+        dinov3_hf.load(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("timm", {"architecture": "convnext_tiny"}, r"architecture is 'convnext_tiny'"),
+        (
+            "dinov2",
+            {"model_type": "dinov3_convnext"},
+            "model_type is 'dinov3_convnext'",
+        ),
+        (
+            "dinov2",
+            {"model_type": "tips"},
+            r"json: model_type is 'tips', expected a ViT",
+        ),
+        (
+            "dinov2",
+            {"model_type": None},
+            "model_type is None, expected a ViT of DINOv3",
+        ),
+        ("dinov2", {"layer_norm_eps": 1e-5}, "json: layer_norm_eps is 1e-05, expected"),
+        ("dinov2", {"qkv_bias": False}, "qkv_bias is False, expected True"),
+        (
+            "dinov2",
+            {"num_attention_heads": "2"},
+            "num_heads is '2', expected an integer",
+        ),
+        ("dinov2", {"num_hidden_layers": 3}, "missing layer.2."),
+        ("dinov2", {"patch_size": 16}, r"patch_embeddings.weight .*14, 14\), expected"),
+        (
+            "dinov2",
+            {"model_type": "dinov3_vit"},
+            "DINOv3 config lacks intermediate_size",
+        ),
+    ],
+)
+def test_other_folders_are_rejected(sources, name, change, message, tmp_path):
+    tensors, config = description(sources, name)
+    path = write(tmp_path, name, tensors, config | change)
+    with pytest.raises((UserError, DataError), match=message):
+        dinov3_hf.load(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"rope_embed.periods": np.float32([1, 2])}, "periods are not powers of 100"),
+        (
+            {"blocks.0.attn.qkv.bias_mask": np.ones(96)},
+            "unexpected layer.0.*k_proj.bias",
+        ),
+        ({"blocks.0.ls1.gamma": np.full(32, np.nan)}, "layer_scale1.* not finite"),
+        ({"pos_embed": np.zeros((1, 17, 32))}, "DINOv2 is read from its Hugging Face"),
+        (
+            {"blocks.0.attn.qkv.bias_mask": np.ones(2)},
+            "unexpected layer.0.*k_proj.bias",
+        ),
+        ({"cls_norm.weight": np.ones(32)}, "unexpected cls_norm.weight"),
+    ],
+)
+def test_other_files_are_rejected(sources, change, message, tmp_path):
+    tensors, config = description(sources, "meta")
+    change = {name: value.astype(np.float32) for name, value in change.items()}
+    path = write(tmp_path, "meta", tensors | change, config)
+    with pytest.raises((UserError, DataError), match=message):
+        dinov3_hf.load(path)
+
+
+@pytest.mark.parametrize("part", "qv")
+def test_a_missing_bias_is_not_zero(sources, part, tmp_path):
+    tensors, config = description(sources, "timm_qkvb")
+    del tensors[f"blocks.0.attn.{part}_bias"]
+    path = write(tmp_path, "timm_qkvb", tensors, config)
+    with pytest.raises(DataError, match=rf"1 problems: missing .*{part}_proj.bias"):
+        dinov3_hf.load(path)
+
+
+def test_files_of_other_networks_are_rejected(tmp_path):
+    # The names of Meta's ConvNeXt.
+    write_pth(tmp_path / "x.pth", {"stages.0.0.norm.bias": np.zeros(3, np.float32)})
+    with pytest.raises(DataError, match=r"expected one state dict .*blocks\.0\."):
+        dinov3_hf.load(tmp_path / "x.pth")
+
+
+def test_rounded_wavelengths_are_those_of_the_base_100(sources, tmp_path):
+    tensors, config = description(sources, "meta")
+    assert tensors["rope_embed.periods"].tolist() == pytest.approx(
+        [1, 100**0.25, 10, 100**0.75]
+    )
+    rounded = np.float32([1, 3.15625, 10, 31.625])  # to bfloat16
+    path = write(tmp_path, "meta", tensors | {"rope_embed.periods": rounded}, config)
+    assert dinov3_hf.load(path)[0].num_heads == 2
+
+
+def test_only_dinov3_is_written(sources, tmp_path):
+    model, variables = dinov3_hf.load(
+        write(tmp_path, "dinov2", *description(sources, "dinov2"))
+    )
+    with pytest.raises(UserError, match="position_grid is 4, expected 0"):
+        dinov3_hf.save(model, variables["params"], tmp_path / "written")

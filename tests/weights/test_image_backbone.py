@@ -1,6 +1,7 @@
 """What radar-camera runs take from files, in place of real weights."""
 
 import flax.linen as nn
+import jax
 import numpy as np
 import pytest
 
@@ -51,7 +52,34 @@ def test_weights_of_another_transformer_are_rejected(monkeypatch):
     monkeypatch.setattr(dinov3_hf, "load", lambda path: (found, {"params": TRUNK}))
     with pytest.raises(UserError, match="num_registers is 3 there and 4 here"):
         image_backbone.load_image_backbone("folder", model)
+    with pytest.raises(
+        UserError, match="folder is DINOv3, another backbone than config"
+    ):
+        image_backbone.load_image_backbone("folder", model)
     same = model.vit.clone(attention="xla", layer_scale=0.5)
     monkeypatch.setattr(dinov3_hf, "load", lambda path: (same, {"params": TRUNK}))
     loaded = image_backbone.load_image_backbone("folder", model)
     assert loaded == {"params": {"image_backbone": TRUNK}}
+
+
+@pytest.mark.parametrize("given", ["DINOv2", "DINOv3"])
+def test_dinov2_and_dinov3_are_told_apart(monkeypatch, given):
+    configs = {"DINOv3": "dinorade", "DINOv2": "dinorade:rcw_dinov2"}
+    models = {kind: build(load_config(name).model) for kind, name in configs.items()}
+    found = models.pop(given).vit
+    (model,) = models.values()
+    monkeypatch.setattr(dinov3_hf, "load", lambda path: (found, {"params": TRUNK}))
+    with pytest.raises(UserError, match=rf"is {given}, .*position_grid is \d+ there"):
+        image_backbone.load_image_backbone("folder", model)
+
+
+def test_dinov2_small_has_the_sizes_of_its_config():
+    model = build(load_config("dinorade:rcw_dinov2").model)
+    # facebook/dinov2-small: 14 x 14 pixels per patch, pretrained at 518 x 518 pixels.
+    assert model.feature_shape == (51, 91, 384)
+    shapes = jax.eval_shape(
+        model.vit.init, jax.random.key(0), np.zeros((1, 28, 28, 3), np.float32)
+    )
+    count = sum(leaf.size for leaf in jax.tree.leaves(shapes))
+    # 22,056,576 parameters, of which a mask token and the biases of the keys are not needed.
+    assert count == 22_056_576 - (1 + 12) * 384

@@ -234,6 +234,18 @@ class KRadar(LabelledFrames[Frame]):
         counts = collections.Counter(cls for f in self._frames for cls in f.classes)
         return {cls: counts[cls] for cls in self.classes}
 
+    def lidar_path(self, frame: Frame) -> pathlib.Path:
+        """Returns the file of a frame's OS2-64 LiDAR scan.
+
+        Raises:
+            FileNotFoundError: No root has it.
+        """
+        name = f"os2-64_{frame.header.lidar:05d}.pcd"
+        path = self.folders.get(frame.sequence, _NO_FOLDER).find("os2-64", name)
+        if path is None:
+            raise FileNotFoundError(f"frame {frame.key}: no os2-64/{name} in any root")
+        return path
+
     def _read(self, split: PathLike | None) -> None:
         """Reads the label files of a split and builds its frames."""
         self._summary = Summary()

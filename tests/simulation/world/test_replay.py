@@ -148,6 +148,24 @@ class TestWrittenTree:
         assert [s.scene_idx for s in source.frames(3)] == [0, 3, 6, 9]
         assert source.frames(3)[1].indices == (34, 4, 8, 12, 14)
 
+    @pytest.mark.parametrize("stride", [1, 2])
+    @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 9, 16])
+    def test_few_frames_are_in_both_splits(self, labels_folder, count, stride):
+        config = make_config(
+            labels_folder, frame_stride=stride, frames_per_sequence=count
+        )
+        source = LabelSource(SimulationConfig.from_mapping(config))
+        specs = source.frames(3)
+        assert len(specs) == min(count, NUM_FRAMES // stride)
+        assert {s.split for s in specs} == {"train", *["test"] * (count > 1)}
+        chosen = [s.scene_idx for s in specs]
+        assert set(np.diff(chosen)) <= {stride}
+        if count > 4 // stride:  # more frames than in the first quarter
+            assert chosen[0] == 0
+        whole = make_config(labels_folder, frame_stride=stride)
+        all_specs = LabelSource(SimulationConfig.from_mapping(whole)).frames(3)
+        assert specs == [s for s in all_specs if s.scene_idx in chosen]
+
     def test_missing_labels(self, tmp_path):
         with pytest.raises(FileNotFoundError, match="No such file"):
             simulate_dataset(
