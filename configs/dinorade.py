@@ -16,6 +16,7 @@ The argument is a list of options, at most one of each group:
   regression losses at the objects' own bins, and with the raw yaw vector in NMS.
 - sigma: `sigma3`, `sigma0.75`, `adaptive`, `anisotropic`, as in `radenet.py`.
 - classes: `all` (default; five classes, v2.1 labels) or `sedan` (v1.1 labels).
+- release: `polar3d` or `rpc`, as in `radenet.py`.
 
 Table 4 reports (Sedan AP of the five-class models, without the option `sedan`, narrow region,
 IoU 0.3):
@@ -94,9 +95,9 @@ CLASS_SETS = ("all", "sedan")
 
 def get_config(arg: str | None = None) -> ConfigDict:
     """Return the complete config; see the module docstring for `arg`."""
-    sigmas = _radenet().SIGMAS
-    variant, preset, sigma, classes = parse_options(
-        arg, VARIANTS, PRESETS, sigmas, CLASS_SETS
+    sigmas, releases = _radenet().SIGMAS, _radenet().RELEASES
+    variant, preset, sigma, classes, release = parse_options(
+        arg, VARIANTS, PRESETS, sigmas, CLASS_SETS, releases
     )
     variant = variant or "rcw"
     config = base_config()
@@ -115,6 +116,8 @@ def get_config(arg: str | None = None) -> ConfigDict:
     config.update_from_flattened_dict(VARIANTS[variant])
     if sigma is not None:
         config.loss.update(sigmas[sigma])
+    if release is not None:
+        config.update_from_flattened_dict(releases[release])
     if variant == "r":
         config.model.name = "radenet"
         for section in ("image", "fusion", "query_grid"):

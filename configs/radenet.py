@@ -15,6 +15,10 @@ The argument is a list of options, at most one of each group:
 - sigma: `sigma3`, `sigma0.75` (in bins), `adaptive`, `anisotropic` (from the size of the object);
   the heatmap targets that the papers compare. It overrides the preset.
 - classes: `all` (default; five classes, v2.1 labels) or `sedan` (v1.1 labels).
+- release: `polar3d` or `rpc`, for K-Radar's reduced releases. The input is centered at the level
+  of the noise (estimated: the mean over Doppler is 6.8 dB below the maximum) or of bins without a
+  point, and scaled as in `quickstart.py`, because the noise is almost constant.
+  `--config.model.doppler_bins=0` leaves out the reconstructed Doppler half.
 
 Table III reports (models with the option `sedan`, narrow region, IoU 0.3):
 
@@ -102,11 +106,17 @@ SIGMAS = {
 
 CLASS_SETS = ("all", "sedan")
 
+RELEASES = {
+    "polar3d": {"model.input_center": 0.52, "model.input_scale": 25.0},
+    "rpc": {"model.input_center": 0.5, "model.input_scale": 25.0},
+}
+"""Fields for K-Radar's reduced releases, see `radejax.data.reduced`."""
+
 
 def get_config(arg: str | None = None) -> ConfigDict:
     """Return the complete config; see the module docstring for `arg`."""
-    variant, preset, sigma, classes = parse_options(
-        arg, VARIANTS, PRESETS, SIGMAS, CLASS_SETS
+    variant, preset, sigma, classes, release = parse_options(
+        arg, VARIANTS, PRESETS, SIGMAS, CLASS_SETS, RELEASES
     )
     config = base_config()
     if preset is not None:
@@ -115,6 +125,8 @@ def get_config(arg: str | None = None) -> ConfigDict:
     config.model.update(VARIANTS[variant or "model"])
     if sigma is not None:
         config.loss.update(SIGMAS[sigma])
+    if release is not None:
+        config.update_from_flattened_dict(RELEASES[release])
     if classes == "sedan":
         config.classes = ("Sedan",)
         config.model.num_classes = 1

@@ -12,6 +12,7 @@
 | quickstart | the quickstart's input scaling and longer training |
 | camera | the quickstart with and without a camera |
 | frames | samples of two consecutive frames and of one |
+| releases | radar tensors and K-Radar's reduced releases, made from the same scenes |
 
 A variant is an ordinary run of a config, or the run of another variant evaluated with shuffled
 images. Runs are trained on the scenes of their seed and evaluated on held-out scenes, which are
@@ -53,6 +54,7 @@ from radejax.core.config import load_config
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
 from radejax.data.kradar.dataset import read_split
+from radejax.data.kradar.reduce import reduce_dataset
 from radejax.data.kradar.write import write_splits
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files import Source, load
@@ -123,6 +125,7 @@ class Work:
             name = f"{self.config(cell, seed).simulation.train_sequences}-seed{seed}"
         count = self.study.frames_per_sequence
         end = f"-{count}_frames" if count > 1 else ""
+        end += f"-{cell.release.replace(' ', '')}" if cell.release else ""
         return self.out / "data" / f"{kind}-{name}{end}"
 
     def data(self, cell: Cell, seed: int | None) -> str:
@@ -133,7 +136,17 @@ class Work:
             simulation |= {"seed": HELD_OUT_SEED, "frames_per_sequence": count}
             simulation |= {"train_sequences": 0, "test_sequences": self.study.held_out}
             simulation["vru_density_scale"] = 1.0  # only training scenes are scaled
-        root = simulate_dataset(simulation, self.root(cell, seed))
+        root = self.root(cell, seed)
+        if cell.release is None:
+            simulate_dataset(simulation, root)
+        else:
+            # The releases share the tensors.
+            tensors = self.root(dataclasses.replace(cell, release="tensors"), seed)
+            simulate_dataset(simulation, tensors)
+            release, _, rate = cell.release.partition(" ")
+            report = reduce_dataset([tensors], root, release, float(rate or 0.01))
+            if report.skipped:
+                raise UserError(report.to_text())
         if self.study.frames_per_sequence > 1:
             keep_last_frames(root)
         return str(root)

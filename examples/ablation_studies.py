@@ -12,6 +12,7 @@ from radejax.core.structures import CLASSES
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[1] / "configs"
 _VARIANTS = load_module(CONFIGS / "radenet.py").VARIANTS
+_RELEASES = load_module(CONFIGS / "radenet.py").RELEASES
 _RADAR = "quickstart:ablation"
 _LABELS = {"data.label_permutation_seed": 0}
 _OWN_INPUT = {"model.input_center": 0.545, "model.input_scale": 25.0}
@@ -26,11 +27,14 @@ class Cell:
         config: Name of a config file and its options, such as "quickstart:ablation".
         fields: Config fields that the variant changes.
         exchanges: Variant whose run is evaluated with shuffled images; None for a new run.
+        release: Reduced release to which the radar tensors are converted, "polar3d" or "rpc"
+            with the fraction of the cells, such as "rpc 0.01"; None for the tensors.
     """
 
     config: str
     fields: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     exchanges: str | None = None
+    release: str | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,6 +82,15 @@ def _row(name: str) -> Cell:
     return Cell(
         _RADAR, fields | ({"model.decoder_width": 64} if name == "expand" else {})
     )
+
+
+def _released(release: str, config: str = _RADAR, **model: Any) -> Cell:
+    """Returns a variant that reads a reduced release instead of the tensors."""
+    fields = {f"model.{k}": v for k, v in model.items()} | {
+        "simulation.output": "tesseract"
+    }
+    fields |= _RELEASES[release.partition(" ")[0]]
+    return Cell(config, fields, release=release)
 
 
 STUDIES = {
@@ -181,6 +194,36 @@ STUDIES = {
             *(
                 Claim(f"all together help {cls}", "quickstart", "model", cls)
                 for cls in CLASSES[2:]
+            ),
+        ),
+        1024,
+    ),
+    "releases": Study(
+        "what K-Radar's reduced releases cost",
+        "input centered",
+        {
+            "input centered": Cell(_RADAR, _OWN_INPUT),
+            "polar3d": _released("polar3d"),
+            "polar3d without Doppler": _released("polar3d", doppler_bins=0),
+            "10 % points": _released("rpc 0.1"),
+            "1 % points": _released("rpc 0.01"),
+            "0.1 % points": _released("rpc 0.001"),
+            "R polar3d": _released("polar3d", "quickstart_fusion:radar"),
+            "R+C+W polar3d": _released("polar3d", "quickstart_fusion:pretrained"),
+        },
+        (
+            Claim("tensors are better than polar3d", "input centered", "polar3d", "mean"),
+            Claim(
+                "the reconstructed Doppler helps", "polar3d", "polar3d without Doppler", "mean"
+            ),
+            *(
+                Claim(f"polar3d is better than {cell}", "polar3d", cell, "mean")
+                for cell in ("10 % points", "1 % points", "0.1 % points")
+            ),
+            Claim("the camera helps polar3d", "R+C+W polar3d", "R polar3d", "mean"),
+            *(
+                Claim(f"the camera helps polar3d, {cls}", "R+C+W polar3d", "R polar3d", cls)
+                for cls in CLASSES
             ),
         ),
         1024,

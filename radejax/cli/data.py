@@ -1,4 +1,4 @@
-"""Commands that prepare datasets: `simulate`, `data check`, `preprocess` and `embed`."""
+"""Commands that prepare datasets: from `simulate` and `data check` to `embed`."""
 
 from __future__ import annotations
 
@@ -11,14 +11,16 @@ import radejax
 from radejax.cli import entry
 from radejax.core.errors import UserError
 
+_new_root = click.option(
+    "--out", required=True, type=entry.FOLDER, help="Root of the new dataset."
+)
+
 
 @click.command(cls=entry.Command)
 @click.option(
     "--config", help="Config with a `simulation` section. Default: a small dataset."
 )
-@click.option(
-    "--out", required=True, type=entry.FOLDER, help="Root of the new dataset."
-)
+@_new_root
 @click.option("--seed", type=click.IntRange(0), help="Replaces the config's seed.")
 @click.option("--scenes", help='"procedural", or a label folder or zip of K-Radar.')
 @entry.sequences
@@ -78,6 +80,7 @@ def data() -> None:
 @data.command(cls=entry.Command)
 @entry.roots
 @entry.labelled_frames
+@entry.camera_calibration
 @click.option("--deep", is_flag=True, help="Read every radar tensor completely.")
 @entry.json_option
 def check(roots: tuple[str, ...], as_json: bool, **options: Any) -> None:
@@ -148,6 +151,38 @@ def preprocess(
 
 
 @click.command(cls=entry.Command)
+@entry.roots
+@_new_root
+@click.option(
+    "--to",
+    "release",
+    required=True,
+    type=click.Choice(["polar3d", "rpc"]),
+    help="polar3d: mean power and Doppler of every cell. rpc: the strongest cells.",
+)
+@click.option(
+    "--rate",
+    type=entry.FRACTION,
+    default=0.01,
+    help="Fraction of the cells (rpc only).",
+)
+def reduce(roots: tuple[str, ...], out: pathlib.Path, **options: Any) -> None:
+    """Write the files of K-Radar's reduced releases from radar tensors.
+
+    The other files of ROOTS become symbolic links. Run again, it writes only missing files.
+    Tensors that are corrupted are skipped and listed, with exit code 1.
+
+    Example: radejax reduce /disk1/kradar --to rpc --rate 0.01 --out /fast/points
+    """
+    from radejax.data.kradar.reduce import reduce_dataset
+
+    report = reduce_dataset(roots, out, **options)
+    click.echo(report.to_text())
+    if report.skipped:
+        raise SystemExit(entry.FAILED)
+
+
+@click.command(cls=entry.Command)
 @click.argument("roots", nargs=-1, type=entry.EXISTING)
 @click.option(
     "--config",
@@ -164,11 +199,11 @@ def preprocess(
     "--out", required=True, type=entry.FOLDER, help="Folder of the embeddings."
 )
 @entry.part
+@entry.camera_calibration
 @click.option(
     "--dtype",
     type=click.Choice(["float32", "float16"]),
-    default="float32",
-    help="Type of the stored embeddings.",
+    help="Type of the embeddings. Default: that of existing ones, otherwise float32.",
 )
 @entry.batch_size(8, "Images per call of the backbone.")
 def embed(
@@ -176,13 +211,14 @@ def embed(
     config: str,
     image_backbone: str,
     out: pathlib.Path,
-    dtype: str,
+    dtype: str | None,
     batch_size: int,
     **part: Any,
 ) -> None:
     """Precompute frozen-backbone features of the front camera images.
 
-    An interrupted job resumes. `radejax train --embeddings OUT` then needs no images.
+    Run again, it embeds only images without an embedding, such as those of another disk.
+    `radejax train --embeddings OUT` then needs no images.
     Without ROOTS, the dataset that the config simulates is used, and made if missing.
 
     Example: radejax embed /disk1/kradar --config dinorade

@@ -38,6 +38,7 @@ from radejax.data.projection import (
     project_columns,
     project_tensor,
 )
+from radejax.data.reduced import check_layout, is_reduced_file, project_reduced
 from radejax.geometry.radar_grid import RadarGrid
 
 VARIABLE = "arrDREA"
@@ -137,7 +138,10 @@ def _projection_axes(
 
 
 def read_frame(path: PathLike, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
-    """Return the float32 projection of a radar tensor file or a released projection.
+    """Return the float32 projection of a radar tensor, or of a file of another release.
+
+    Files of `.npy` contain projections of the reference implementation or, by their names,
+    frames of K-Radar's reduced releases (see `radejax.data.reduced`).
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -146,6 +150,8 @@ def read_frame(path: PathLike, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
     if pathlib.Path(path).suffix != ".npy":
         projection = project_file(path, shape_drea=grid.shape_drea)
         return grid.measured_channels(projection)
+    if is_reduced_file(path):
+        return project_reduced(read_npy(path, mapped=True), grid, str(path))
     projection = read_projection_npy(path, projection_shape=grid.projection_shape)
     return projection.astype(np.float32)
 
@@ -157,6 +163,8 @@ def check_frame(path: PathLike, grid: RadarGrid, *, deep: bool = False) -> None:
     """
     if deep:
         read_frame(path, grid)
+    elif is_reduced_file(path):
+        check_layout(read_npy(path, mapped=True), grid, str(path))
     elif pathlib.Path(path).suffix == ".npy":
         _projection_axes(path, read_npy(path, mapped=True), grid.projection_shape)
     else:

@@ -289,6 +289,10 @@ class RadarGrid(ArrayValues):
             return self.range_step_m
         return np.gradient(self.range_m)
 
+    def without_doppler(self) -> RadarGrid:
+        """Returns the grid without its Doppler axis."""
+        return dataclasses.replace(self, doppler_mps=np.array([]))
+
     def measured_channels(
         self, projection: Float[Any, "*bins DE"]
     ) -> Float[Any, "*bins _"]:

@@ -33,6 +33,7 @@ from radejax.data.projection import (
     stack_frames,
     to_log_scale,
 )
+from radejax.data.reduced import is_reduced, polar_shape, project_reduced
 from radejax.data.tesseract import read_frame
 from radejax.detection.decode import DecodeOptions, decode
 from radejax.geometry.camera import (
@@ -253,11 +254,12 @@ class Detector:
         """Detect the objects in one or more frames.
 
         Args:
-            frames: Projections `[B, R, A, D+E]` or tesseracts `[B, D, R, E, A]` in
-                linear power, a single frame without the axis B, the path of a file, or a
-                list of arrays and paths. Alternatively a `Batch`, whose image and camera
-                are used. A model of several frames takes consecutive frames, oldest first,
-                on an axis of length `num_frames` after B; a list is one sample.
+            frames: Projections `[B, R, A, D+E]`, tesseracts `[B, D, R, E, A]` in linear
+                power, or `polar3d` frames `[B, 2, R, A, E]`; a single frame without the
+                axis B, or points `[N, 11]`; the path of a file; or a list of arrays and
+                paths. Alternatively a `Batch`, whose image and camera are used. A model of
+                several frames takes consecutive frames, oldest first, on an axis of length
+                `num_frames` after B; a list is one sample.
             image: Images for a radar-camera model: `[B, H, W, 3]` uint8, embedded images,
                 or a list of arrays, paths and None.
             camera: One calibration for all frames, or a list with one per frame.
@@ -476,8 +478,8 @@ def radar_batch(
     """Combine radar frames into one array with a leading axis B.
 
     Args:
-        frames: Projections or tesseracts: an array, a path, or a list of arrays and
-            paths, see `Detector.__call__`.
+        frames: Radar data: an array, a path, or a list of arrays and paths, see
+            `Detector.__call__`.
         grid: Axes of the sensor.
         num_frames: Number T of frames of a sample.
 
@@ -485,15 +487,16 @@ def radar_batch(
         Projections `[B T, R, A, D+E]` or tesseracts `[B T, D, R, E, A]`.
 
     Raises:
-        UserError: The shape is neither that of projections nor that of tesseracts, or
-            there is no frame.
+        UserError: The shape is that of no radar data, or there is no frame.
+        DataError: A file is corrupted, or a frame of a reduced release is not as in the
+            release.
     """
     radar = _read_paths(frames, lambda path, _: read_frame(path, grid))
     if isinstance(radar, list):
         if not radar:
             raise UserError("no frames: the list is empty")
-        radar = np.stack([as_numbers(frame, "frames") for frame in radar])
-    radar = as_numbers(radar, "frames")
+        radar = np.stack([_projected(frame, grid) for frame in radar])
+    radar = _projected(radar, grid)
     shape = tuple(np.shape(radar))
     projection, tesseract = grid.projection_shape, grid.shape_drea
     axes, steps = ("B", ()) if num_frames == 1 else (f"B, {num_frames}", (num_frames,))
@@ -509,6 +512,16 @@ def radar_batch(
         text += f" of {num_frames} consecutive frames (config.data.num_frames), oldest "
         text += "first; Detector.stream takes single frames and keeps preceding ones"
     raise UserError(text)
+
+
+def _projected(frames: Any, grid: RadarGrid) -> Any:
+    """Convert an array to numbers, and frames of a reduced release to projections."""
+    array = as_numbers(frames, "frames")
+    if is_reduced(array, grid):
+        return project_reduced(np.asarray(array), grid)
+    if array.shape[1:] == polar_shape(grid) != grid.shape_drea and len(array):
+        return np.stack([project_reduced(np.asarray(x), grid) for x in array])
+    return array
 
 
 def count_invalid(frames: Real[Any, "B ..."], *, warn: bool) -> int:

@@ -95,6 +95,8 @@ class Data:
             sequence_numbers=options.sequences or None,
             weather=options.weather or None,
         )
+        if self.frames.release is not None and not config.model.doppler_bins:
+            self.frames.grid = self.frames.grid.without_doppler()
         if options.format != "kradar":  # the reader of K-Radar checks its labels itself
             self.frames = self.frames.with_valid_boxes()
 
@@ -262,7 +264,7 @@ def located(config: ConfigDict) -> ConfigDict:
             "no data: give --data ROOT[,ROOT...] with K-Radar's sequence folders, or a "
             "config that simulates them, such as quickstart"
         )
-    _set_paths(options, roots)
+    _set_paths(config, roots)
     _check_exist(() if is_simulated else options.roots)
     _check_exist((options.labels, options.embeddings, options.image_backbone))
     return config
@@ -280,11 +282,16 @@ def _simulated_root(simulation: ConfigDict) -> str:
     return f"data/simulated-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
 
 
-def _set_paths(options: ConfigDict, roots: Iterable[str]) -> None:
-    """Make paths of `config.data` absolute; records are in the first root by default."""
+def _set_paths(config: ConfigDict, roots: Iterable[str]) -> None:
+    """Make paths of `config.data` absolute; records are in the first root by default.
+
+    Those without Doppler have a folder of their own.
+    """
+    options = config.data
+    folder = "records" if config.model.doppler_bins else "records_without_doppler"
     roots = tuple(str(as_path(root).absolute()) for root in roots)
     paths = {name: options[name] for name in DATA_PATHS if name != "roots"}
-    paths["records"] = paths["records"] or as_path(roots[0]) / "records"
+    paths["records"] = paths["records"] or as_path(roots[0]) / folder
     absolute = {n: x and str(as_path(x).absolute()) for n, x in paths.items()}
     with options.ignore_type():  # a checkpoint's config has lists instead of tuples
         options.update(absolute, roots=roots)
@@ -319,6 +326,13 @@ def open_data(config: ConfigDict, model: nn.Module) -> Data:
     simulate_missing(config)
     data = Data(config, model)
     _log.info("%s", data.frames.summary().to_text())
+    used = {f.key for name in ("train", "test") for f in data.frames.of_split(name)}
+    if unused := [frame.key for frame in data.split("all") if frame.key not in used]:
+        _log.warning(
+            "%d frames are not used, as they are in neither the train nor the test split; "
+            "the first is %s",
+            *(len(unused), unused[0]),
+        )
     # Preprocessing can take hours, so the data are checked before it.
     check_bins(config.model, data.frames.grid, f"the radar of {data.options.roots[0]}")
     frames = data.split("train")
@@ -392,7 +406,7 @@ def data_of_run(
         changes = whole | changes
     with options.ignore_type():
         options.update(changes)
-    _set_paths(options, roots)
+    _set_paths(config, roots)
     data = Data(config, saved.model)
     found, name = data.frames.grid, f"the radar of {options.roots[0]}"
     expected = f"{records.describe_grid(saved.grid)}, as the model was trained"

@@ -1,5 +1,6 @@
 """Tests of the ablations: runs, resuming, differences and verdicts."""
 
+import dataclasses
 import json
 import pathlib
 from typing import Any
@@ -12,12 +13,20 @@ from click.testing import CliRunner
 from radejax.core import files
 from radejax.core.config import load_config, override
 from radejax.core.structures import CLASSES
+from radejax.data.kradar import KRadar
 from radejax.evaluation.report import write_report
 from radejax.evaluation.results import EvaluationOptions
 from radejax.runs import checks
+from radejax.simulation.dataset import simulate_dataset
 
 SKILL = {"sigma 3": 0.4, "model": 0.7, "sigma 0.75": 0.9, "shuffled labels": 0.1}
 """Fraction of the objects that a cell detects; 0.5 by default."""
+
+
+NOT_MEASURED = {"frames", "releases"}
+"""Tables whose runs have not been made."""
+
+GRID = {"doppler": 4, "range": 32, "elevation": 5, "azimuth": 28}
 
 
 class _Runs:
@@ -192,7 +201,7 @@ def test_every_cell_is_a_config_and_its_command_makes_it(table: str) -> None:
         override(again, texts)
         assert again.to_json() == config.to_json()
         if not cell.exchanges:
-            seen.append(config.to_json())
+            seen.append((config.to_json(), cell.release))
         assert work.run_folder(name, 2).name == "seed2"
     assert len(set(seen)) == len(seen)  # cells differ
     for claim in study.claims:
@@ -200,7 +209,44 @@ def test_every_cell_is_a_config_and_its_command_makes_it(table: str) -> None:
         assert claim.cls in (*CLASSES, "mean")
 
 
-@pytest.mark.parametrize("table", sorted(ablation.STUDIES.keys() - {"frames"}))
+def test_releases_are_made_of_the_tensors_of_the_same_scenes(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With real data: simulated tensors, the frames of the releases, their projections."""
+    study = ablation.STUDIES["releases"]
+    grid = {f"simulation.grid.num_{k}": n for k, n in GRID.items()}
+    size = {"simulation.train_sequences": 2, "simulation.image_width": 32}
+    cells = {
+        name: dataclasses.replace(cell, fields={**cell.fields, **size, **grid})
+        for name, cell in study.cells.items()
+        if cell.config == study.cells[study.base].config
+    }
+    study = dataclasses.replace(study, cells=cells, held_out=3)
+    work = ablation.Work(study, tmp_path)
+    found = {}
+    for seed, count in ((1, 4), (None, 3)):
+        for name, cell in cells.items():
+            root = work.data(cell, seed)
+            frames = KRadar(root)
+            assert len(frames) == count
+            assert frames.release == (cell.release and cell.release.split()[0])
+            found[name] = frames[0].read_projection(frames.grid)
+            experiment_config = work.config(cell, seed or 0)
+            if seed is not None:  # the run finds the data complete
+                simulate_dataset(experiment_config.simulation, root)
+    base, polar = found["input centered"], found["polar3d"]
+    assert (base.max(-1) > polar.max(-1)).mean() > 0.95
+    num_cells = [(found[f"{rate} % points"] > 0.5).sum() for rate in (10, 1, 0.1)]
+    assert num_cells[0] > num_cells[1] > num_cells[2] > 0
+    tensors = sorted(path.name for path in (tmp_path / "data").iterdir())
+    assert tensors == [
+        f"quickstart-{part}{end}"
+        for part in ("2-seed1", "held")
+        for end in ("", "-polar3d", "-rpc0.001", "-rpc0.01", "-rpc0.1", "-tensors")
+    ]
+
+
+@pytest.mark.parametrize("table", sorted({*ablation.STUDIES} - NOT_MEASURED))
 def test_documented_numbers_are_those_of_the_table_beside(table: str) -> None:
     docs = ablation.CONFIGS.parent / "docs"
     content = json.loads(

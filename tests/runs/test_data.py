@@ -6,6 +6,7 @@ import shutil
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from ml_collections import ConfigDict
 
@@ -13,6 +14,8 @@ from radejax import models
 from radejax.core.config import base_config
 from radejax.core.errors import UserError
 from radejax.data.kradar import KRadar
+from radejax.data.kradar.reduce import reduce_dataset
+from radejax.runs import checks
 from radejax.runs import data as run_data
 from radejax.runs.data import Data, data_name, data_of_run, located, open_data
 from radejax.simulation.dataset import default_config, simulate_dataset
@@ -123,6 +126,34 @@ def test_frames_are_projected_beside_their_data_once(
     assert written() == before
 
 
+def test_reduced_releases_are_read_with_and_without_doppler(
+    root: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    """Also next to each other, as they have records of their own."""
+    simulation = default_config() | {"frames_per_sequence": 1, "image_width": 0}
+    simulation |= {"train_sequences": 2, "test_sequences": 1}
+    tensors = simulate_dataset(simulation, tmp_path / "tensors", progress=False)
+    reduced = tmp_path / "reduced"
+    reduce_dataset([tensors], reduced, "polar3d")
+    found = {}
+    for doppler_bins in (16, 0):
+        config = _config(reduced)
+        config.model.doppler_bins = doppler_bins
+        config.simulation = ConfigDict(simulation)
+        checks.check(config)
+        data = _open(config)
+        assert data.frames.grid.num_doppler == doppler_bins
+        found[doppler_bins] = data.records[data.split("test")[0].key]
+    assert found[16].shape == (64, 56, 16 + 9)
+    np.testing.assert_array_equal(found[0], found[16][..., 16:])
+    config.data.roots, config.simulation = (str(root),), None
+    del config.simulation
+    with pytest.raises(
+        UserError, match=r"doppler_bins is 0, expected 16, as the radar"
+    ):
+        _open(config)
+
+
 def test_results_on_other_data_are_named_by_folder_and_labels(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -149,6 +180,32 @@ def test_frames_without_a_radar_tensor_that_can_be_read_are_left_out(
     assert len(data.split("all")) == len(data.records.keys()) == 5
     part = _open(_config(root, sequences=(1, 3)))  # the same records
     assert len(part.split("all")) == 3
+
+
+def test_frames_that_are_in_no_split_are_counted(
+    root: pathlib.Path, tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    disk = tmp_path / "disk2"
+    (disk / "split").mkdir(parents=True)
+    for number in "23":  # of the train and of the test split
+        shutil.move(root / number, disk / number)
+    entries = (root / "split" / "train.txt").read_text().splitlines(keepends=True)
+    for folder, number in ((root, "1,"), (disk, "2,")):
+        own = [line for line in entries if line.startswith(number)]
+        (folder / "split" / "train.txt").write_text("".join(own))
+    test = (root / "split" / "test.txt").rename(disk / "split" / "test.txt")
+    with caplog.at_level("WARNING", "radejax"):
+        data = _open(_config(root, disk))
+    assert [frame.sequence for frame in data.split("train")] == [1, 1, 2, 2]
+    assert [frame.sequence for frame in data.split("test")] == [3, 3]
+    assert "not used" not in caplog.text
+    (disk / "split" / "train.txt").unlink()
+    test.write_text(test.read_text().splitlines()[0])
+    with caplog.at_level("WARNING", "radejax"):
+        _open(_config(root, disk))
+    assert "3 frames are not used, as they are in neither the train nor" in caplog.text
+    first = next(frame.key for frame in data.split("train") if frame.sequence == 2)
+    assert f"the first is {first}" in caplog.text
 
 
 def test_a_run_is_evaluated_on_its_part_or_on_all_of_other_folders(

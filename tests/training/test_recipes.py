@@ -109,6 +109,22 @@ def test_an_option_for_sigma_changes_only_the_targets(name: str, preset: str) ->
         _get(name, "sigma3,adaptive")
 
 
+@pytest.mark.parametrize("name", ["radenet", "dinorade"])
+@pytest.mark.parametrize("release", ["polar3d", "rpc"])
+def test_an_option_for_a_release_changes_only_the_input(
+    name: str, release: str
+) -> None:
+    plain = _get(name, "official,sedan").to_dict()
+    config = _get(name, f"official,sedan,{release}").to_dict()
+    checks.check(ConfigDict(config))
+    model = config["model"]
+    # Half of K-Radar's noise and all echoes are positive.
+    assert 0.5 <= model.pop("input_center") <= 0.52
+    assert model.pop("input_scale") == 25.0
+    plain["model"] = {k: v for k, v in plain["model"].items() if k in model}
+    assert config == plain
+
+
 def test_every_sigma_has_a_finite_gradient_of_its_own(tiny: Any) -> None:
     """At the maps; steps of the network with them are among those of all configs."""
     batch = jax.tree.map(lambda x: x[:2], tiny.frames)

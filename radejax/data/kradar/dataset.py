@@ -48,6 +48,7 @@ from radejax.data.kradar.labels import (
     normalize_version,
     read_label_file,
 )
+from radejax.data.reduced import RELEASES, UNUSABLE_POINTS
 from radejax.geometry.camera import KRADAR_RADAR_FROM_LIDAR_Z_M, RADAR_FROM_LIDAR_M
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -84,7 +85,8 @@ class Frame(LabelledFrame):
         visibility: Visibility flags of `boxes`.
         tesseract_path: File of the 4D radar tensor, or None if it is missing.
         projection_path: File of the `.npy` projection of the reference implementation,
-            or None if it is missing. It is the `radar_path` if the tensor is missing.
+            or of a reduced release, or None if it is missing. It is the `radar_path` if
+            the tensor is missing.
     """
 
     header: LabelHeader
@@ -107,9 +109,9 @@ class KRadar(LabelledFrames[Frame]):
         version: Version of these labels: v1.0, v1.1, v2.0 or v2.1.
         split: "train" or "test", the path of a split file, or None for every frame.
             The official split files are searched as `<split>.txt` in `split/`,
-            `resources/split/` and the top level of the roots, of `labels` and of its
-            parent folder. Without them, K-Radar's rule (alternating quarters of every
-            sequence) is applied, which `summary()` notes.
+            `resources/split/` and the top level of every root, whose entries are merged,
+            or else of `labels` and of its parent folder. Without them, K-Radar's rule
+            (alternating quarters of every sequence) is applied, which `summary()` notes.
         visibility: Visibility flags of the objects to keep, or None for all.
         include_unstarred_v11_labels: Whether lines of v1.x labels without a `*` are
             objects too, as in the reference implementation.
@@ -126,12 +128,14 @@ class KRadar(LabelledFrames[Frame]):
         grid: Sensor axes of K-Radar, or of the `radar_grid.json` in a root.
         roots: Folders that contain the sequences.
         folders: Folders of every sequence in the roots, by sequence number.
+        release: Reduced release that the roots contain ("polar3d" or "rpc"), or None.
         is_simulated: Whether the simulator wrote the roots or the labels.
 
     Raises:
         FileNotFoundError: A root or `labels` does not exist.
-        UserError: There are no sequences, labels or labels of the given sequences; an
-            option has an invalid value; or the labels have another version.
+        UserError: There are no sequences, labels or labels of the given sequences; the
+            roots contain several forms of radar data; an option has an invalid value; or
+            the labels have another version.
         DataError: The folders, the labels or the split file are ambiguous or corrupted
             as a whole.
 
@@ -172,6 +176,7 @@ class KRadar(LabelledFrames[Frame]):
 
         roots = self.roots = _as_paths(root)
         self.folders = find_sequences(roots)
+        self.release = find_release(self.folders)
         names = ", ".join(map(str, roots))
         if not self.folders and (roots or labels is None):
             raise UserError(f"no sequence folders (1, 2, ...) in the roots: {names}")
@@ -189,7 +194,6 @@ class KRadar(LabelledFrames[Frame]):
             self._label_source = str(labels)
             self._label_paths = find_labels(as_path(labels))
             self._split_folders += [as_path(labels), as_path(labels).parent]
-        grid = _read_common(roots, "radar_grid.json", RadarGrid.from_dict)
         z_m = _read_common(
             self._split_folders,
             SIMULATION_MARKER,
@@ -197,7 +201,7 @@ class KRadar(LabelledFrames[Frame]):
         )
         # K-Radar's own files do not contain the height offset between radar and LiDAR.
         self._radar_from_lidar_z_m = KRADAR_RADAR_FROM_LIDAR_Z_M if z_m is None else z_m
-        super().__init__([], grid or RadarGrid.kradar(), is_simulated=z_m is not None)
+        super().__init__([], read_grid(roots), is_simulated=z_m is not None)
         self._camera_folders = _as_paths(camera_calibration)
         self._camera_folders += [r / name for r in roots for name in _CAMERA_FOLDERS]
         self._common_camera = common_camera
@@ -311,18 +315,16 @@ class KRadar(LabelledFrames[Frame]):
                     f"split {split!r} is neither 'train', 'test', None nor a split file"
                 )
             return set(read_split(split))
-        paths = {
-            name: _first_file(
-                self._split_folders, [f"{place}/{name}.txt" for place in _SPLIT_FOLDERS]
-            )
-            for name in ("train", "test")
+        paths = {name: self._split_files(name) for name in ("train", "test")}
+        entries = {
+            n: set[Key]().union(*map(read_split, of)) for n, of in paths.items() if of
         }
-        entries = {name: set(read_split(path)) for name, path in paths.items() if path}
         if len(entries) == 2 and (both := sorted(entries["train"] & entries["test"])):
+            train, test = (", ".join(map(str, files)) for files in paths.values())
             message = (
                 f"{both[0][0]}/{both[0][1]}: the first of {len(both)} frames that are in "
-                f"both {paths['train']} and {paths['test']}; a model is evaluated on "
-                "frames that it was trained on"
+                f"both {train} and {test}; a model is evaluated on frames that it was "
+                "trained on"
             )
             self._report("split", message)
             _log.warning(message)
@@ -336,6 +338,13 @@ class KRadar(LabelledFrames[Frame]):
             for number, group in itertools.groupby(keys, key=lambda key: key[0])
             for name in split_by_rule([name for _, name in group], split)
         }
+
+    def _split_files(self, split: str) -> list[pathlib.Path]:
+        """Returns the files of a split: of every root, or else one beside the labels."""
+        names = [f"{place}/{split}.txt" for place in _SPLIT_FOLDERS]
+        files = [_first_file([folder], names) for folder in self._split_folders]
+        of_roots = list(filter(None, files[: len(self.roots)]))
+        return of_roots or list(filter(None, files))[:1]
 
     def _report(self, kind: str, message: str) -> None:
         self._summary.problems.append((kind, message))
@@ -484,12 +493,16 @@ class KRadar(LabelledFrames[Frame]):
         stem = f"tesseract_{header.radar:05d}"
         tesseract = folder.find("radar_tesseract", f"{stem}.mat")
         projection = folder.find("DERA_tesseract", f"DERA_{stem}.npy")
+        wanted = f"radar_tesseract/{stem}.mat"
+        if self.release is not None:
+            wanted = f"{self.release}_{header.radar:05d}.npy"
+            projection = folder.find(".", wanted)
         camera = folder.find("cam-front", f"cam-front_{header.camera_front:05d}.png")
         if folder.folders:
             if not (tesseract or projection):
                 self._report(
                     "tesseract missing",
-                    f"{key[0]}/{key[1]}: no radar_tesseract/{stem}.mat in "
+                    f"{key[0]}/{key[1]}: no {wanted} in "
                     + ", ".join(map(str, folder.folders)),
                 )
             self.counts["frames without front image"] += camera is None
@@ -567,6 +580,31 @@ def find_sequences(roots: Sequence[pathlib.Path]) -> dict[int, SequenceFolder]:
     return {number: SequenceFolder(found[number]) for number in sorted(found)}
 
 
+def find_release(folders: Mapping[int, SequenceFolder]) -> str | None:
+    """Returns the reduced release that the sequences contain, or None without one.
+
+    Raises:
+        UserError: The sequences contain radar data in several forms, or only points of a
+            Cartesian grid.
+    """
+    found: dict[str, pathlib.Path] = {}
+    for folder in folders.values():
+        for name in ("radar_tesseract", "DERA_tesseract", "."):
+            for path in folder.listing(name).values():
+                form = path.name.partition("_")[0] if name == "." else "tesseract"
+                if path.suffix in (".mat", ".npy"):
+                    found.setdefault(form, path)
+    forms = [found[form] for form in ("tesseract", *RELEASES) if form in found]
+    if len(forms) > 1:
+        raise UserError(
+            f"{forms[0]} and {forms[1]} are different forms of radar data, which cannot "
+            "be mixed in one dataset: name only roots of one form"
+        )
+    if not forms and "sprdr" in found:
+        raise UserError(f"{found['sprdr']}: {UNUSABLE_POINTS}")
+    return next((form for form in RELEASES if form in found), None)
+
+
 def _first_file(
     folders: Sequence[pathlib.Path], names: Sequence[str]
 ) -> pathlib.Path | None:
@@ -616,6 +654,16 @@ def _read_common(
             "cannot be read as one"
         )
     return next(iter(found.values()), None)
+
+
+def read_grid(roots: Sequence[pathlib.Path]) -> RadarGrid:
+    """Returns the sensor axes of the `radar_grid.json` in a root, or those of K-Radar.
+
+    Raises:
+        DataError: The file is malformed, or the roots have different ones.
+    """
+    grid = _read_common(roots, "radar_grid.json", RadarGrid.from_dict)
+    return grid or RadarGrid.kradar()
 
 
 # Label files -------------------------------------------------------------------------

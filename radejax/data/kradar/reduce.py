@@ -1,0 +1,72 @@
+"""Writer of K-Radar's reduced releases from 4D radar tensors."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Iterable
+
+import numpy as np
+from tqdm import tqdm
+
+from radejax.core.errors import DataError, require
+from radejax.core.files import PathLike, as_path, atomic_write
+from radejax.data.kradar.dataset import find_sequences, read_grid
+from radejax.data.records import PreprocessReport, describe_grid
+from radejax.data.reduced import reduce_tensor, strongest_points
+from radejax.data.tesseract import project_file, read_tesseract
+
+_LEFT_OUT = shutil.ignore_patterns("radar_tesseract", "DERA_tesseract", "records*")
+
+
+def reduce_dataset(
+    roots: Iterable[PathLike], out: PathLike, release: str, rate: float = 0.01
+) -> PreprocessReport:
+    """Writes a dataset with the frames of a reduced release instead of radar tensors.
+
+    The other files of the roots become symbolic links. Existing files are kept, so that an
+    interrupted call can be repeated.
+
+    Args:
+        roots: Folders that contain the sequences.
+        out: Root of the new dataset.
+        release: "polar3d" or "rpc".
+        rate: Fraction of the cells that become points of "rpc".
+
+    Raises:
+        FileNotFoundError: A root does not exist.
+        UserError: The rate is out of its range.
+        DataError: The folders are ambiguous.
+    """
+    require(0 < rate < 1, "rate", rate, "a number above 0 and below 1")
+    began, out, paths = time.perf_counter(), as_path(out), list(map(as_path, roots))
+    grid, targets = read_grid(paths), {}
+    least = min(grid.num_doppler - 1, grid.num_elevation)
+    require(least > 0, "the radar's grid", describe_grid(grid), "four axes")
+    for root in paths:
+        shutil.copytree(root, out, False, _LEFT_OUT, _link, dirs_exist_ok=True)
+    for folder in find_sequences(paths).values():
+        for path in folder.listing("radar_tesseract").values():
+            name = f"{release}_{path.stem.rpartition('_')[2]}.npy"
+            targets[path] = out / folder.folders[0].name / name
+    missing = [path for path in targets if not targets[path].exists()]
+    skipped = {}
+    for path in tqdm(missing, "reduce", unit="frame"):
+        try:
+            project_file(path, shape_drea=grid.shape_drea)  # checks the values
+            frame = reduce_tensor(read_tesseract(path), grid)
+        except (DataError, OSError) as error:
+            skipped[str(path)] = str(error)
+            continue
+        if release == "rpc":
+            frame = strongest_points(frame, grid, rate)
+        with atomic_write(targets[path]) as file:
+            np.save(file, frame)
+    num_found, seconds = len(targets) - len(missing), time.perf_counter() - began
+    return PreprocessReport(len(targets), num_found, skipped, seconds)
+
+
+def _link(path: str, target: str) -> None:
+    if not os.path.lexists(target):
+        os.symlink(os.path.abspath(path), target)

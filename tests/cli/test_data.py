@@ -1,0 +1,189 @@
+"""Commands on K-Radar's reduced releases, with two disks and a zip file of labels."""
+
+import json
+import pathlib
+import zipfile
+from types import SimpleNamespace
+from typing import Any
+
+import click.testing
+import numpy as np
+import pytest
+
+from radejax import Detector, KRadar, models
+from radejax.cli import figures, main
+from radejax.core.errors import DataError
+from radejax.data.cameras import CameraOptions
+from radejax.data.records import Records
+from radejax.inference.detect_files import find_frames, front_images
+from radejax.inference.saved import SavedModel, save_model
+from radejax.simulation.config import default_config
+from radejax.simulation.dataset import simulate_dataset
+
+from .. import small_models as small
+
+RELEASES = ("polar3d", "rpc")
+
+
+def _run(*arguments: object, code: int = 0) -> click.testing.Result:
+    arguments = tuple(map(str, arguments))
+    result = click.testing.CliRunner().invoke(main.main, arguments)
+    assert result.exit_code == code, result.output
+    return result
+
+
+@pytest.fixture(scope="module")
+def tensors(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+    """A simulated root with radar tensors."""
+    simulation = default_config()
+    simulation.update(train_sequences=2, test_sequences=1, frames_per_sequence=4)
+    simulation["grid"] |= {
+        "num_doppler": 4,
+        "num_range": 24,
+        "num_elevation": 3,
+        "num_azimuth": 16,
+    }
+    root = tmp_path_factory.mktemp("simulated") / "root"
+    return simulate_dataset(simulation, root, progress=False)
+
+
+@pytest.fixture(scope="module", params=RELEASES)
+def disks(
+    request: pytest.FixtureRequest,
+    tensors: pathlib.Path,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Any:
+    """Two disks, one with radar frames only, and a zip file of the labels."""
+    folder = tmp_path_factory.mktemp(request.param)
+    others, radar = folder / "others", folder / "radar"
+    options = ("--to", request.param, "--rate", 0.1, "--out", others)
+    assert "12 preprocessed" in _run("reduce", tensors, *options).output
+    for path in others.glob(f"*/{request.param}_*.npy"):
+        target = radar / path.parent.name / path.name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        path.rename(target)
+    labels = folder / "labels.zip"
+    with zipfile.ZipFile(labels, "w") as archive:
+        for path in others.glob("*/info_label_v2_1/*.txt"):
+            archive.write(path, f"{path.parts[-3]}/{path.name}")
+            path.unlink()
+    return request.param, (radar, others), labels
+
+
+def _model(doppler_bins: int, root: pathlib.Path) -> SavedModel:
+    """An untrained radar-only model for the simulated radar."""
+    config = small.radar_config()
+    config.model.update(doppler_bins=doppler_bins, elevation_bins=3)
+    grid = KRadar(root).grid
+    grid = grid if doppler_bins else grid.without_doppler()
+    model = models.build(config.model)
+    inputs = np.zeros((1, *grid.projection_shape), np.float32)
+    return SavedModel(config, grid, small.drawn(model, inputs))
+
+
+def test_frames_are_checked_preprocessed_and_drawn(
+    disks: Any, tmp_path: pathlib.Path
+) -> None:
+    release, roots, labels = disks
+    report = json.loads(
+        _run("data", "check", *roots, "--labels", labels, "--deep", "--json").output
+    )
+    assert report["summary"]["num_problems"] == 0
+    assert [row["projections"] for row in report["sequences"]] == [4, 4, 4]
+    records = tmp_path / "records"
+    for shard, count in (("0/2", 6), ("1/2", 6), ("0/1", 0)):
+        words = ("--labels", labels, "--out", records, "--shard", shard)
+        text = _run("preprocess", *roots, *words).output
+        assert f"{count} preprocessed, 0 skipped" in text
+    opened = Records.open(records)
+    assert (len(opened.keys()), opened.source["release"]) == (12, release)
+    assert opened.shape == (24, 16, 4 + 3)
+    data = ("--data", ",".join(map(str, roots)), "--labels", labels)
+    name = sorted(opened.keys())[0]
+    for options in ((), ("--slices",)):
+        out = tmp_path / f"{len(options)}.png"
+        _run("overlay", name, *data, *options, "--out", out)
+        assert out.stat().st_size > 10_000
+    frames = KRadar(roots, labels, visibility=None)
+    (scene,) = figures.viewer_scenes([frames[0]], frames.grid)
+    assert scene.image is not None
+
+
+@pytest.mark.parametrize("doppler_bins", [4, 0])
+def test_boxes_are_found_in_files_and_arrays(
+    disks: Any, tensors: pathlib.Path, tmp_path: pathlib.Path, doppler_bins: int
+) -> None:
+    release, roots, _ = disks
+    saved = _model(doppler_bins, tensors)
+    save_model(saved, tmp_path / "model")
+    words = ("--workdir", tmp_path / "model", "--out", tmp_path / "boxes")
+    assert "in 12 frames" in _run("detect", roots[0], *words).output
+    paths = sorted(roots[0].glob(f"1/{release}_*.npy"))
+    names = {f"1_{path.stem.partition('_')[2]}.json" for path in paths}
+    assert names < {path.name for path in (tmp_path / "boxes").iterdir()}
+
+    detector = Detector(saved, batch_sizes=(4,))
+    arrays = [np.load(path) for path in paths]
+    expected = np.asarray(detector(paths).boxes)
+    assert detector.num_invalid_frames == 0
+    for frames in (arrays, [arrays[0], *paths[1:]]):
+        np.testing.assert_array_equal(np.asarray(detector(frames).boxes), expected)
+    np.testing.assert_array_equal(detector(arrays[0]).boxes, expected[:1])
+    if release == "polar3d":
+        np.testing.assert_array_equal(detector(np.stack(arrays)).boxes, expected)
+    with pytest.raises(DataError, match=r"^frame: "):
+        detector([arrays[0] * 1e13])
+
+
+def test_images_on_another_disk_are_found(disks: Any) -> None:
+    _, roots, labels = disks
+    paths = find_frames(roots)
+    assert len(paths) == 12
+    model = SimpleNamespace(image_size=(180, 320))
+    detector: Any = SimpleNamespace(model=model, camera_options=CameraOptions())
+    found = front_images(paths, detector, labels, roots=roots)
+    assert set(found) == set(paths)
+    for path, (image, camera) in found.items():
+        assert image.parents[1] == roots[1] / path.parent.name
+        assert camera.is_valid
+    assert not front_images(paths, detector, roots=roots[:1])
+
+
+def test_other_roots_are_wrong_use(
+    disks: Any, tensors: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    release, roots, _ = disks
+    text = _run(
+        "preprocess", tensors, *roots, "--out", tmp_path / "records", code=2
+    ).output
+    assert text.startswith("error: ")
+    assert f"{release}_000" in text
+    assert text.endswith("name only roots of one form\n")
+    words = ("--to", "rpc", "--rate", "0", "--out", tmp_path / "out")
+    assert "rate is 0.0, expected" in _run("reduce", tensors, *words, code=2).output
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("one_device")
+@pytest.mark.parametrize("doppler_bins", [4, 0])
+def test_a_run_is_trained_evaluated_and_detects(
+    disks: Any, tmp_path: pathlib.Path, doppler_bins: int
+) -> None:
+    from radejax.cli.train import train
+
+    _, roots, labels = disks
+    config = small.radar_config()
+    config.model.update(doppler_bins=doppler_bins, elevation_bins=3)
+    config.train.update(batch_size=4, num_epochs=1, checkpoint_every_steps=1)
+    config.evaluation.num_visualizations = 1
+    path = small.write_config(tmp_path / "config.py", config)
+    data = ["--data", ",".join(map(str, roots)), "--labels", str(labels)]
+    words = [f"--config={path}", *data, f"--workdir={tmp_path / 'run'}"]
+    words.append(f"--records={tmp_path / 'records'}")
+    result = click.testing.CliRunner().invoke(train, words)
+    assert result.exit_code == 0, result.output
+    assert Records.open(tmp_path / "records").shape == (24, 16, doppler_bins + 3)
+    assert (tmp_path / "run/evaluation/metrics.json").is_file()
+    _run("evaluate", tmp_path / "run", "--split", "train")
+    words = ["--workdir", str(tmp_path / "run"), "--out", str(tmp_path / "boxes")]
+    assert "in 12 frames" in _run("detect", roots[0], *words).output

@@ -1,0 +1,144 @@
+"""Datasets of reduced releases: written, recognized, spread over disks, mixed."""
+
+import shutil
+import zipfile
+
+import numpy as np
+import pytest
+
+from radejax.core.errors import UserError
+from radejax.data.kradar import KRadar
+from radejax.data.kradar.check import check_dataset
+from radejax.data.kradar.reduce import reduce_dataset
+from radejax.data.records import Records, open_projections, preprocess
+from radejax.data.reduced import project_reduced, reduce_tensor, strongest_points
+from radejax.data.tesseract import read_tesseract
+
+
+def reduced_root(source, out, release):
+    report = reduce_dataset([source], out, release, 0.2)
+    assert not report.skipped
+    return out
+
+
+@pytest.mark.parametrize("release", ["polar3d", "rpc"])
+def test_frames_are_those_of_the_tensors(kradar_root, tmp_path, release):
+    root = reduced_root(kradar_root, tmp_path / "out", release)
+    whole, data = KRadar(kradar_root), KRadar(root)
+    assert (whole.release, data.release) == (None, release)
+    assert [f.key for f in data] == [f.key for f in whole]
+    assert not data.summary().problems
+    assert data.grid == whole.grid
+    for frame, full in zip(data, whole, strict=True):
+        np.testing.assert_array_equal(frame.boxes, full.boxes)
+        assert frame.weather == full.weather == "fog"
+        polar = reduce_tensor(read_tesseract(full.tesseract_path), data.grid)
+        if release == "rpc":
+            polar = strongest_points(polar, data.grid, 0.2)
+        assert frame.radar_path == root / str(frame.sequence) / (
+            f"{release}_{frame.header.radar:05d}.npy"
+        )
+        stored = np.load(frame.radar_path)
+        np.testing.assert_array_equal(stored, polar)
+        assert stored.dtype == np.float64
+        np.testing.assert_array_equal(
+            frame.read_projection(data.grid), project_reduced(polar, data.grid)
+        )
+
+
+def test_writing_resumes_and_lists_corrupted_tensors(kradar_root, tmp_path):
+    source = shutil.copytree(kradar_root, tmp_path / "in")
+    (source / "records").mkdir()
+    (source / "1/radar_tesseract/tesseract_00004.mat").write_bytes(b"no tensor")
+    out = tmp_path / "out"
+    report = reduce_dataset([source], out, "polar3d")
+    assert (report.num_frames, report.num_written) == (12, 11)
+    ((path, reason),) = report.skipped.items()
+    assert path.endswith("tesseract_00004.mat")
+    assert "not a MATLAB v5 file" in reason
+    assert sorted(path.name for path in out.iterdir()) == [
+        "1",
+        "2",
+        "radar_grid.json",
+        "split",
+    ]
+    assert (out / "1/description.txt").is_symlink()
+    (out / "2/polar3d_00005.npy").unlink()
+    again = reduce_dataset([source], out, "polar3d")
+    assert (again.num_found, again.num_written, len(again.skipped)) == (10, 1, 1)
+    with pytest.raises(UserError, match=r"rate is 1\.5, expected"):
+        reduce_dataset([source], out, "rpc", 1.5)
+
+
+def test_tensors_in_decibels_are_not_reduced(kradar_root, kradar_writer, tmp_path):
+    from radejax.data.kradar import write
+
+    kradar_writer(tmp_path / "in", sequences=(1,), num_frames=1)
+    path = tmp_path / "in/1/radar_tesseract/tesseract_00004.mat"
+    tensor = 10 * np.log10(read_tesseract(path))
+    write.write_tesseract(path, tensor)
+    report = reduce_dataset([tmp_path / "in"], tmp_path / "out", "polar3d")
+    assert "as in decibels" in report.skipped[str(path)]
+
+
+def test_two_disks_a_label_zip_and_a_partial_copy(kradar_root, tmp_path):
+    """Radar data as the archives have them: sequence folders with frames only."""
+    root = reduced_root(kradar_root, tmp_path / "out", "polar3d")
+    radar, others = tmp_path / "radar", tmp_path / "others"
+    for path in root.glob("*/polar3d_*.npy"):
+        target = radar / path.relative_to(root)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        path.rename(target)
+    (radar / "2/polar3d_00005.npy").unlink()
+    with zipfile.ZipFile(tmp_path / "labels.zip", "w") as archive:
+        for path in root.glob("*/info_label/*.txt"):
+            archive.write(path, f"{path.parts[-3]}/{path.name}")
+            path.unlink()
+        archive.writestr("7/00001_00001.txt", "a sequence that was not downloaded")
+    shutil.copytree(root, others)
+    data = KRadar([radar, others], tmp_path / "labels.zip", split="train")
+    assert data.release == "polar3d"
+    assert len(data) == 8
+    assert data[0].radar_path.parent == radar / "1"
+    report = check_dataset([radar, others], labels=tmp_path / "labels.zip")
+    (problem,) = report.summary.problems
+    assert problem[1].startswith("2/00005_00002: no polar3d_00005.npy in ")
+    assert [row["projections"] for row in report.sequences] == [6, 5]
+    records = tmp_path / "records"
+    whole = KRadar([radar, others], tmp_path / "labels.zip")
+    for shard in range(3):
+        done = preprocess(whole, records, shard=(shard, 3), progress=False)
+        assert len(done.skipped) == (shard == 1)
+    assert len(open_projections(records, whole.grid).keys()) == 11
+    assert Records.open(records).source["release"] == "polar3d"
+    with pytest.raises(UserError, match="release"):
+        preprocess(KRadar(kradar_root), records, progress=False)
+
+
+def test_corrupted_frames_are_found_and_skipped(kradar_root, tmp_path):
+    root = reduced_root(kradar_root, tmp_path / "out", "polar3d")
+    path = root / "1/polar3d_00006.npy"
+    np.save(path, np.load(path)[[0, 1]] * [[[[1e13]]], [[[1]]]])
+    path.with_name("polar3d_00007.npy").write_bytes(b"\x93NUMPY")
+    shallow, deep = (check_dataset(root, deep=deep) for deep in (False, True))
+    assert shallow.summary.problem_counts() == {"projection corrupted": 1}
+    assert deep.summary.problem_counts() == {"projection corrupted": 2}
+    report = preprocess(KRadar(root), tmp_path / "records", progress=False)
+    assert sorted(report.skipped) == ["1/00006_00003", "1/00007_00004"]
+    assert "divided by 1e+13" in report.skipped["1/00006_00003"]
+
+
+def test_mixed_roots_and_unusable_points_are_rejected(kradar_root, tmp_path):
+    polar = reduced_root(kradar_root, tmp_path / "polar", "polar3d")
+    points = reduced_root(kradar_root, tmp_path / "points", "rpc")
+    for roots, names in (
+        ([kradar_root, polar], r"tesseract_0000\d.mat and .*polar3d_0000\d.npy"),
+        ([points, polar], r"polar3d_0000\d.npy and .*rpc_0000\d.npy"),
+    ):
+        with pytest.raises(UserError, match=f"{names} are different forms") as error:
+            KRadar(roots)
+        assert str(error.value).endswith("name only roots of one form")
+    for path in points.glob("*/rpc_*.npy"):
+        path.rename(path.with_name(path.name.replace("rpc", "sprdr")))
+    with pytest.raises(UserError, match=r"sprdr_0000\d.npy: points \[N, 4\]"):
+        KRadar(points)
