@@ -3,8 +3,8 @@
 import json
 import pathlib
 import re
+import shutil
 import sys
-import types
 from collections.abc import Iterator
 from typing import Any
 
@@ -24,11 +24,9 @@ from radejax.data.pipeline import camera_inputs
 from radejax.data.projection import project_tensor
 from radejax.data.records import preprocess
 from radejax.evaluation.evaluation_set import EvaluationSet
-from radejax.evaluation.protocols import PROTOCOLS
 from radejax.inference.detect_files import detect_files
-from radejax.losses.detection import LOSSES
-from radejax.models.backbone import BACKBONES
-from radejax.models.heads import HEADS, NECKS
+from radejax.inference.detector import Detector
+from radejax.inference.export import export
 from radejax.runs import checks, experiment
 from radejax.runs.data import Data
 from radejax.runs.evaluate import evaluate_run
@@ -39,7 +37,6 @@ from .evaluation.scenes import random_scene
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "extending.md"
-NAMES = (NECKS, HEADS, BACKBONES, LOSSES, PROTOCOLS)
 EXCERPTS = re.findall(
     r"^```py\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.S
 )[1:]  # the first one writes K-Radar folders
@@ -47,29 +44,39 @@ BLOCKS = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.MULTILINE | r
 
 
 @pytest.fixture(autouse=True)
-def _page(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Run the page and remove its registered names afterwards."""
-    before = [dict(names) for names in NAMES]
-    for number, block in enumerate(BLOCKS):
-        module = types.ModuleType("page")
-        monkeypatch.setitem(sys.modules, module.__name__, module)
-        exec(compile(block, f"{PAGE}, block {number + 1}", "exec"), vars(module))
-    monkeypatch.setitem(sys.modules, "toy", toy_reader)
+def page(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Save the reader and the blocks of the page as modules that Python finds."""
+    folder = tmp_path / "modules"
+    folder.mkdir()
+    monkeypatch.syspath_prepend(folder)
+    (folder / "parts.py").write_text("\n\n".join(BLOCKS))
+    shutil.copy(toy_reader.__file__, folder / "toy.py")
     yield
-    for names, kept in zip(NAMES, before, strict=True):
-        names.clear()
-        names.update(kept)
+    _forget()
+
+
+def _forget() -> None:
+    """Remove the imported modules, as if a new process had started."""
+    for name in ("toy", "parts"):
+        sys.modules.pop(name, None)
 
 
 def _config() -> ConfigDict:
     """Config of the small model with every component of the page."""
     config = small.radar_config()
-    config.model.update(backbone="flat", neck="strip", heads="wide")
-    config.loss.weights.height = 0.5
+    config.model.update(
+        name="parts:PowerNet",
+        exponent=3,
+        backbone="parts:FlatBackbone",
+        neck="parts:StripNeck",
+        heads="parts:WideHead",
+    )
+    config.loss.own_terms = ("parts:height_loss",)
+    config.loss.weights.height_loss = 0.5
     config.data.format = "toy:Toy"
     config.train.update(batch_size=2, num_epochs=1, warmup_steps=0)
     config.evaluation.update(batch_size=2, num_visualizations=0)
-    config.evaluation.protocols = ("all_point",)
+    config.evaluation.protocols = ("parts:EVERY_FRAME", "all_point")
     return config
 
 
@@ -96,11 +103,7 @@ def _write_toy(root: pathlib.Path) -> pathlib.Path:
 
 
 def test_the_page_has_every_kind_of_part() -> None:
-    assert len(BLOCKS) == len(NAMES)
-    for names, name in zip(
-        NAMES, ("strip", "wide", "flat", "height", "free101"), strict=True
-    ):
-        assert name in names
+    assert len(BLOCKS) == 6
 
 
 def test_configs_may_name_the_parts_and_the_model_has_them() -> None:
@@ -112,6 +115,22 @@ def test_configs_may_name_the_parts_and_the_model_has_them() -> None:
     assert "Conv_1" in made["neck"]
     assert made["heads"]["box"]["conv_1"]["conv"]["kernel"].shape[-1] == 16
     assert len(made["backbone"]) == 3
+
+
+def test_own_models_may_have_a_camera(tmp_path: pathlib.Path) -> None:
+    text = (
+        "from radejax.models.dinorade import DinoRade\n"
+        "class Own(DinoRade, kw_only=True):\n    gain: float = 1.0\n"
+    )
+    (tmp_path / "modules" / "parts.py").write_text(text)
+    config = small.camera_config().model
+    config.update(name="parts:Own", gain=2.0)
+    model = models.build(config)
+    assert models.has_camera(model)
+    assert type(model).__name__ == "Own"
+    del config.gain
+    with pytest.raises(UserError, match=r"config\.model\.gain is missing"):
+        models.build(config)
 
 
 def test_the_page_shows_the_example_line_by_line() -> None:
@@ -161,7 +180,7 @@ def test_records_of_other_files_or_of_another_reader_are_reported(
     assert "radar files of 1 of them, such as that of frame 1/0002, have" in again()
     monkeypatch.setattr(reader, "reader_version", "2")
     with pytest.raises(
-        UserError, match=r"other records: source.reader is \['tests.toy_reader:Toy', ''"
+        UserError, match=r"other records: source.reader is \['toy:Toy', ''"
     ):
         again()
 
@@ -218,26 +237,60 @@ def test_written_folders_are_read(
 def test_the_protocol_counts_every_frame() -> None:
     truth, found, frames = random_scene(0)
     data = EvaluationSet(truth, found, frames=frames)
-    result = data.results(protocol="free101", spaces=("3d",), iou_thresholds=(0.3,))[0]
-    assert result.protocol == "free101"
+    name = "parts:EVERY_FRAME"
+    result = data.results(protocol=name, spaces=("3d",), iou_thresholds=(0.3,))[0]
+    assert result.protocol == name
     assert 0 < result.ap < 100
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        (
+            "model.neck",
+            "strip",
+            "'strip', expected 'dilated' or 'plain' or module:Object",
+        ),
+        ("model.neck", "parts:Strip", "module 'parts' has no attribute 'Strip'"),
+        ("model.neck", "no_module:Strip", "in the folder of no_module, or add"),
+        ("model.neck", "parts:WideHead", "expected the name of a Neck"),
+        ("model.heads", "parts:height_loss", "expected the name of a Head"),
+        ("model.name", "parts:StripNeck", "expected the name of a RadeNet"),
+        ("model.exponents", 2, "exponents is not a field of this model"),
+        ("loss.own_terms", ("parts:focal_loss",), "has no attribute 'focal_loss'"),
+        (
+            "loss.own_terms",
+            ("parts:height_loss", "json:loads"),
+            "smooth_l1, height_loss, loads, and for all of own_terms",
+        ),
+        ("loss.own_terms", (), "for some of focal, gwd, smooth_l1, and"),
+        ("evaluation.protocols", ("parts:PowerNet",), "the name of a Protocol"),
+        ("data.format", "parts:PowerNet", "expected the name of a LabelledFrames"),
+    ],
+)
+def test_a_wrong_part_is_named(name: str, value: Any, message: str) -> None:
+    config = _config()
+    section, field = name.split(".")
+    config[section][field] = value
+    with pytest.raises(UserError, match=rf"^config\.{section}\..*{message}"):
+        checks.check(config)
 
 
 def test_an_unknown_format_is_named_with_those_that_there_are() -> None:
     config = _config()
     config.data.format = "nuscenes"
     with pytest.raises(
-        UserError, match=r"format is 'nuscenes', expected kradar or module:Class"
+        UserError, match=r"format is 'nuscenes', expected 'kradar' or module:Object"
     ):
         Data(config, models.build(config.model))
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("one_device")
-def test_all_parts_are_trained_and_evaluated_on_the_toy_data(
-    tmp_path: pathlib.Path,
+def test_own_parts_are_imported_wherever_a_run_is_opened(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One step, a checkpoint, its evaluation on the same data."""
+    """One step on the toy data, then each command as if in a process of its own."""
     root, folder = _write_toy(tmp_path / "toy"), tmp_path / "run"
     config = _config()
     config.data.roots = (str(root),)
@@ -245,24 +298,47 @@ def test_all_parts_are_trained_and_evaluated_on_the_toy_data(
     experiment.run(config, folder)
     row: dict[str, Any] = json.loads((folder / "metrics.jsonl").read_text())
     assert row["step"] == 1
-    assert np.isfinite([row[name] for name in ("focal", "gwd", "height")]).all()
+    assert np.isfinite([row[name] for name in ("focal", "gwd", "height_loss")]).all()
     config = json.loads((folder / "config.json").read_text())
-    assert config["loss"]["weights"]["height"] == 0.5
+    assert config["loss"]["weights"]["height_loss"] == 0.5
     source = json.loads((folder / "evaluation" / "source.json").read_text())
     assert source["step"] == 1
+    _forget()
     report = evaluate_run(folder)
     assert report is not None
     source = json.loads((folder / "evaluation" / "source.json").read_text())
     assert source["roots"] == [str(root)]
     metrics = json.loads((folder / "evaluation" / "metrics.json").read_text())
     assert metrics["options"]["classes"][0] == "Tram"
+    assert metrics["options"]["protocols"] == ["parts:EVERY_FRAME", "all_point"]
     assert "labels=" not in json.dumps(metrics)
+    _forget()
     found = detect_files(folder, [root], tmp_path / "boxes", score_threshold=0.0)
     assert found["frames"] == 4
     names = sorted(path.name for path in (tmp_path / "boxes").iterdir())
     assert names == ["1_0001.json", "1_0002.json", "2_0001.json", "2_0002.json"]
     boxes = json.loads((tmp_path / "boxes" / names[0]).read_text())
     assert {box["frame"] for box in boxes} == {"1/0001"}
+    _forget()
+    detector = Detector.from_workdir(folder)
+    assert type(detector.model).__name__ == "PowerNet"
+    assert detector.model.exponent == 3
+    out = tmp_path / "exported"
+    _forget()
+    export(Detector.from_workdir(folder), out, platforms=("cpu",))
+    assert "parts:PowerNet" in (out / "README.md").read_text()
+    _forget()
+    projection = np.full((1, *detector.grid.projection_shape), 0.5, np.float32)
+    again = Detector.from_workdir(out)
+    wanted = detector(projection, score_threshold=0.0)
+    found = again(projection, score_threshold=0.0)
+    np.testing.assert_array_equal(found.boxes, wanted.boxes)
+    monkeypatch.undo()  # the folder of parts.py is not searched any more
+    _forget()
+    with pytest.raises(
+        UserError, match=r"is 'parts:\w+': No module named 'parts'; run"
+    ):
+        Detector.from_workdir(folder)
 
 
 def test_a_format_may_name_a_class_of_a_module() -> None:

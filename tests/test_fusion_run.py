@@ -339,6 +339,19 @@ def test_detect_finds_the_images_by_the_labels(from_images, tmp_path):
         [box["x"] for box in expected], abs=1e-3
     )
 
+    calib = (root / "calib").rename(tmp_path / "repository")
+    command = ["detect", str(root), "--workdir", str(from_images)]
+    command += ["--score-threshold", "0", "--out", str(tmp_path / "command")]
+    failed = CliRunner().invoke(main, command)
+    assert failed.exit_code == 2
+    assert "4 no camera calibration" in failed.output
+    command += ["--camera-calibration", str(calib)]
+    done = CliRunner().invoke(main, command, catch_exceptions=False)
+    assert "radar only" not in done.stdout
+    given = json.loads((tmp_path / "command" / name).read_text())
+    assert given == seen[name]
+    calib.rename(root / "calib")
+
     (root / folder.name / "cam-front" / frame.camera_path.name).unlink()
     one_missing, blind = detect("blind")
     assert one_missing == 1
@@ -445,6 +458,44 @@ def test_example_draws_reference_points(data, from_images, tmp_path):
     assert 5 < share < 100
     assert count > 50
     assert out.stat().st_size > 10_000
+
+
+def test_embeddings_grow_with_a_second_disk(data, from_images, tmp_path):
+    disk = tmp_path / "disk1"
+    second = shutil.copytree(data.folder, tmp_path / "disk2")
+    shutil.rmtree(second / "records")
+    disk.mkdir()
+    (second / "1").rename(disk / "1")
+    for name in ("radar_grid.json", "split", "calib", "simulation.json"):
+        if (second / name).is_dir():
+            shutil.copytree(second / name, disk / name)
+        else:
+            shutil.copy(second / name, disk / name)
+    wrong = small_config()
+    wrong.model.image.size = (32, 80)
+    out = tmp_path / "out"
+
+    def embed(*roots, config, options=()):
+        path = small.write_config(tmp_path / "config.py", config)
+        command = ["embed", *map(str, roots), "--config", str(path), "--out", str(out)]
+        command += ["--image-backbone", str(data.backbone), *options]
+        return CliRunner().invoke(main, command)
+
+    failed = embed(disk, config=wrong)
+    assert failed.exit_code == 1
+    assert "expected 160 x 32 (stereo) or 80 x 32" in failed.output
+    half = ("--dtype", "float16")
+    done = embed(disk, config=small_config(), options=half)
+    assert "4 embedded, 0 found" in done.output, done.output
+    done = embed(disk, second, config=small_config())
+    assert "8 embedded, 4 found" in done.output, done.output
+    assert len(open_embeddings(out).keys()) == 12
+    config = small_config()
+    config.data.update(roots=(str(disk), str(second)), embeddings=str(out))
+    own = Data(config, build(config.model))
+    assert own.images(own.frames).image(11).dtype == np.float16
+    other = embed(disk, config=wrong)
+    assert "other records: shape is" in other.output
 
 
 def test_embed_command(data, from_images, tmp_path, monkeypatch):

@@ -80,6 +80,7 @@ def data() -> None:
 @data.command(cls=entry.Command)
 @entry.roots
 @entry.labelled_frames
+@entry.camera_calibration
 @click.option("--deep", is_flag=True, help="Read every radar tensor completely.")
 @entry.json_option
 def check(roots: tuple[str, ...], as_json: bool, **options: Any) -> None:
@@ -198,11 +199,11 @@ def reduce(roots: tuple[str, ...], out: pathlib.Path, **options: Any) -> None:
     "--out", required=True, type=entry.FOLDER, help="Folder of the embeddings."
 )
 @entry.part
+@entry.camera_calibration
 @click.option(
     "--dtype",
     type=click.Choice(["float32", "float16"]),
-    default="float32",
-    help="Type of the stored embeddings.",
+    help="Type of the embeddings. Default: that of existing ones, otherwise float32.",
 )
 @entry.batch_size(8, "Images per call of the backbone.")
 def embed(
@@ -210,13 +211,14 @@ def embed(
     config: str,
     image_backbone: str,
     out: pathlib.Path,
-    dtype: str,
+    dtype: str | None,
     batch_size: int,
     **part: Any,
 ) -> None:
     """Precompute frozen-backbone features of the front camera images.
 
-    An interrupted job resumes. `radejax train --embeddings OUT` then needs no images.
+    Run again, it embeds only images without an embedding, such as those of another disk.
+    `radejax train --embeddings OUT` then needs no images.
     Without ROOTS, the dataset that the config simulates is used, and made if missing.
 
     Example: radejax embed /disk1/kradar --config dinorade

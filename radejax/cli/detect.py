@@ -24,6 +24,7 @@ from radejax.cli import entry
 @click.option("--out", required=True, type=entry.FOLDER, help="Folder of the boxes.")
 @entry.step
 @entry.part
+@entry.camera_calibration
 @click.option(
     "--score-threshold",
     type=entry.FRACTION,
@@ -71,8 +72,9 @@ def detect(
         text += f"; {count['clipped']} with a size that was clipped to be positive"
     if "repeated" in count:
         text += f"; {count['repeated']} without a preceding frame, which were repeated"
-    if "radar_only" in count:
-        text += f"; {count['radar_only']} without an image, from the radar only"
+    if count.get("radar_only"):
+        reason = "without a label file, image or calibration"
+        text += f"; {count['radar_only']} {reason}, from the radar only"
     entry.echo_result(as_json, {**count, "out": str(out)}, text)
 
 

@@ -298,6 +298,12 @@ labelled_frames = together(
     ),
     part,
 )
+camera_calibration = click.option(
+    "--camera-calibration",
+    type=EXISTING,
+    help="Folder of camera calibrations (calib_seq_v2/ and common/ of K-Radar's "
+    "repository). Default: in the data.",
+)
 beside_data = together(
     click.option(
         "--records",
@@ -307,11 +313,7 @@ beside_data = together(
     click.option(
         "--embeddings", help="Folder of `radejax embed`, used instead of the images."
     ),
-    click.option(
-        "--camera-calibration",
-        help="Folder of camera calibrations (calib_seq_v2/ and common/ of K-Radar's "
-        "repository). Default: in the data.",
-    ),
+    camera_calibration,
 )
 step = click.option(
     "--checkpoint",

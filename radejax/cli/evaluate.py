@@ -234,8 +234,8 @@ def _settings(path: Any, given: dict[str, Any], bootstrap: int) -> tuple[Any, An
         values |= stored_options(place)
     values |= {"bootstrap": bootstrap} | given
 
-    def made(kind: Any) -> Any:
+    def made(kind: Any, values: dict[str, Any]) -> Any:
         names = [field.name for field in dataclasses.fields(kind)]
         return kind(**{name: values[name] for name in names if name in values})
 
-    return made(Source), made(EvaluationOptions)
+    return made(Source, given), made(EvaluationOptions, values)

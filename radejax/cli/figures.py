@@ -24,6 +24,7 @@ MODEL = pathlib.Path(__file__).with_name("demo_model")
 @click.argument("name", metavar="[FRAME]", default="")
 @entry.several("--data", "roots", required=True, help="Roots of K-Radar.")
 @entry.labelled_frames
+@entry.camera_calibration
 @entry.out_file("overlay.png", "Image file, or .gif or .mp4 for several frames.")
 @click.option(
     "--slices",
@@ -88,12 +89,26 @@ def overlay(
             f"no frame {frame_name} in sequence {sequence}; there are "
             f"{frames[0].name} to {frames[-1].name}"
         )
-    if out.suffix.lower() in ANIMATIONS:
-        shown = tqdm.tqdm(found[:max_frames], "draw", unit="frame")
+    is_animation = out.suffix.lower() in ANIMATIONS
+    found = found[: max_frames if is_animation else 1]
+    if is_animation:
+        shown = tqdm.tqdm(found, "draw", unit="frame")
         animate((_draw(frames, frame, slices, lidar, roi) for frame in shown), out)
     else:
         save_figure(_draw(frames, found[0], slices, lidar, roi), out)
-    click.echo(f"drew {out}")
+    click.echo(f"drew {out}{'' if slices else _undrawn(found)}")
+
+
+def _undrawn(frames: Any) -> str:
+    """Says for how many frames no boxes are drawn on an image, and why."""
+    images = sum(frame.camera_path is None for frame in frames)
+    calibrations = sum(frame.camera_calibration_path is None for frame in frames)
+    if not images + calibrations:
+        return ""
+    return (
+        f"; not all have boxes on the image: {images} of {len(frames)} frames have no front "
+        f"image, {calibrations} no camera calibration (--camera-calibration FOLDER)"
+    )
 
 
 def _draw(frames: Any, frame: Any, slices: bool, lidar: bool, roi: str) -> Any:
@@ -119,6 +134,7 @@ def _draw(frames: Any, frame: Any, slices: bool, lidar: bool, roi: str) -> Any:
 @entry.roots
 @entry.out_file("recording.rrd", "File of the recording.")
 @entry.labelled_frames
+@entry.camera_calibration
 @click.option("--workdir", type=entry.EXISTING, help="Run whose detections are drawn.")
 @entry.max_frames
 def view(
@@ -153,7 +169,7 @@ def view(
     text = f"{len(shown)} frames written to {out}"
     if lacking := len(frames) - len(complete):
         text += f"; {lacking} without radar tensor or projection skipped"
-    click.echo(text)
+    click.echo(text + _undrawn(shown))
 
 
 def viewer_scenes(frames: Any, grid: Any, detector: Any = None) -> Iterator[Any]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import ast
 import copy
 import difflib
+import importlib
 import importlib.util
 import json
 import os
@@ -22,7 +23,7 @@ from ml_collections import ConfigDict
 from ml_collections.config_dict import placeholder
 from ml_collections.config_flags import config_path
 
-from radejax.core.errors import UserError
+from radejax.core.errors import UserError, require
 from radejax.core.files import as_path
 from radejax.core.structures import CLASSES, NARROW_ROI
 
@@ -75,6 +76,37 @@ def load_module(path: str | os.PathLike[str]) -> types.ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+def find_part(
+    name: str, field: str, known: Mapping[str, Any], kind: type = object
+) -> Any:
+    """Returns the class, function or object that a field of a config names.
+
+    Args:
+        name: Name of a known part, or "module:Object" for another one, which is imported.
+            Commands find modules in the current folder too.
+        field: Name of the field for the error message.
+        known: Parts by name.
+        kind: Class from which the part is derived, or of which it is an instance.
+
+    Raises:
+        UserError: There is no such part, or it is of another kind.
+    """
+    part, (module, _, attribute) = known.get(name), str(name).partition(":")
+    if part is None:
+        expected = " or ".join([*map(repr, known), "module:Object"])
+        require(bool(module and attribute), field, name, expected)
+        try:
+            part = getattr(importlib.import_module(module), attribute)
+        except (ImportError, AttributeError) as error:
+            raise UserError(
+                f"{field} is {name!r}: {error}; run this in the folder of {module}, or add "
+                "that folder to PYTHONPATH"
+            ) from None
+    is_kind = kind in getattr(part, "__mro__", type(part).__mro__)
+    require(is_kind, field, name, f"the name of a {kind.__name__}")
+    return part
 
 
 def config_file(name: str | os.PathLike[str]) -> pathlib.Path:
@@ -140,7 +172,7 @@ _FIELDS: dict[str, Any] = {
     # Classes to detect, in the order of the class indices.
     "classes": CLASSES,
     "model": {
-        # Architecture: radenet or dinorade.
+        # Architecture: radenet, dinorade or module:Class.
         "name": "radenet",
         # Number of classes; must equal the length of `classes`.
         "num_classes": len(CLASSES),
@@ -159,11 +191,11 @@ _FIELDS: dict[str, Any] = {
         "cbam": "official",
         # Separate convolutions for Doppler and elevation channels at the input.
         "input_stem": False,
-        # A name of `radejax.models.backbone.BACKBONES`.
+        # unet or module:Class.
         "backbone": "unet",
-        # dilated, plain, or another name of `radejax.models.heads.NECKS`.
+        # dilated, plain or module:Class.
         "neck": "dilated",
-        # expanded, default, or another name of `radejax.models.heads.HEADS`.
+        # expanded, default or module:Class.
         "heads": "expanded",
         # Maps are padded to a multiple of this, itself a multiple of 2 to the power
         # of the number of encoder levels.
@@ -197,8 +229,10 @@ _FIELDS: dict[str, Any] = {
         # Boxes of the regression losses: center (the objects' own bins) or nms
         # (predictions that match an object after NMS, with the thresholds of decode).
         "assignment": "center",
-        # Weight of every loss term, at least 0, by its name in
-        # `radejax.losses.detection.LOSSES`.
+        # Other loss terms, each module:function.
+        "own_terms": (),
+        # Weight of every loss term, at least 0: focal, gwd, smooth_l1 and the functions
+        # of `own_terms` by name.
         "weights": {"focal": 2.0, "gwd": 1.0, "smooth_l1": 1.0},
         # Divide each term by its own value, without a gradient through the divisor. The
         # value of the loss is then the sum of the weights.
@@ -314,7 +348,7 @@ _FIELDS: dict[str, Any] = {
     "evaluation": {
         # Region of interest: x0, x1, y0, y1, z0, z1 in meters; None: everywhere.
         "roi": NARROW_ROI,
-        # Evaluation protocols; the first chooses the best checkpoint.
+        # Evaluation protocols, or module:Object; the first chooses the best checkpoint.
         "protocols": ("coco101", "all_point", "kradar_r40"),
         # Frames that are excluded: protocol (by the protocol's own rule), class (frames
         # without an object of the class), frame (frames without any object), none.

@@ -9,7 +9,6 @@ from __future__ import annotations
 import collections
 import copy
 import dataclasses
-import importlib
 import pathlib
 from collections.abc import Callable, Collection, Sequence
 from typing import Any, Self, TypeVar
@@ -17,7 +16,8 @@ from typing import Any, Self, TypeVar
 import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 
-from radejax.core.errors import UserError, require
+from radejax.core.config import find_part
+from radejax.core.errors import UserError
 from radejax.data.cameras import IMAGE_SIZE, read_left_image
 from radejax.data.tesseract import read_frame
 from radejax.geometry.camera import CameraCalibration
@@ -269,13 +269,8 @@ def data_set(name: str) -> Callable[..., LabelledFrames]:
     Raises:
         UserError: There is no such name, or the class cannot be imported.
     """
-    name = "radejax.data.kradar:KRadar" if name == "kradar" else name
-    module, _, attribute = name.partition(":")
-    require(bool(attribute), "config.data.format", name, "kradar or module:Class")
-    try:
-        return getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise UserError(f"config.data.format is {name!r}: {error}") from None
+    place = "radejax.data.kradar:KRadar" if name == "kradar" else name
+    return find_part(place, "config.data.format", {"kradar": None}, LabelledFrames)
 
 
 def front_view(

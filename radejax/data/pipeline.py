@@ -170,21 +170,21 @@ def _camera(
 
 
 def require_images(
-    frames: FrameSequence, inputs: CameraInputs | None, split: str = "train"
+    frames: FrameSequence, inputs: CameraInputs | None, name: str = "train split"
 ) -> None:
     """Raises a `UserError` if no frame has both an image and a calibration.
 
     Args:
-        frames: Frames of the split.
+        frames: Frames of a split.
         inputs: Camera inputs of these frames, or None for models without a camera.
-        split: Name of the split for the error message.
+        name: Name of the frames for the error message.
     """
     if inputs is None or any(camera.is_valid for camera in inputs.cameras):
         return
     images = sum(frame.camera_path is None for frame in frames)
     calibrations = sum(frame.camera_calibration_path is None for frame in frames)
     raise UserError(
-        f"no frame of the {split} split ({len(frames)}) can use the camera: {images} have "
+        f"no frame of the {name} ({len(frames)}) can use the camera: {images} have "
         f"no front image (cam-front/cam-front_*.png), {calibrations} no camera calibration "
         "(calib_seq_v2/seq_*/cam_1.yml or common/cam_front0.yml of K-Radar's repository: "
         "--camera-calibration FOLDER)"

@@ -89,18 +89,38 @@ class Records:
         cls,
         folder: files.PathLike,
         shape: Sequence[int],
-        dtype: str,
+        dtype: str | None,
         source: Mapping[str, Any],
+        default_dtype: str = "float16",
     ) -> Records:
         """Creates records in a new folder, or opens existing ones of the same kind.
+
+        A folder in which nothing was written yet becomes one of the wanted kind.
+
+        Args:
+            folder: Folder of the records.
+            shape: Shape of every array.
+            dtype: Type of every array; None for that of existing records.
+            source: JSON values that describe how the records are created.
+            default_dtype: Type of new records if `dtype` is None.
 
         Raises:
             UserError: The dtype is unknown, or the folder has records of another kind;
                 the message lists the differences.
         """
+        path = files.as_path(folder) / _DESCRIPTION
+        if dtype is None:
+            dtype = cls.open(folder).dtype if path.is_file() else default_dtype
         require(dtype in ENCODINGS, "dtype", dtype, f"one of {', '.join(ENCODINGS)}")
         wanted = {"shape": list(shape), "dtype": dtype, "source": source}
-        files.claim(files.as_path(folder) / _DESCRIPTION, wanted, "other records")
+        try:
+            files.claim(path, wanted, "other records")
+        except UserError:
+            if files.find_files(path.parent, "*.npy"):
+                raise
+            files.write_json(
+                path, wanted
+            )  # of a call that failed before its first record
         return cls.open(folder)
 
     @functools.cached_property
@@ -304,14 +324,11 @@ def preprocess(
             records of another kind, or a worker process was killed.
         DataError: `records.json` is corrupted.
     """
-    began, folder = time.perf_counter(), files.as_path(folder)
+    began = time.perf_counter()
     if not len(frames):
         raise UserError("no frames to preprocess")
     index, count = shard
     require(0 <= index < count, "shard", shard, "(i, n) with i from 0 to n - 1")
-    if dtype is None:
-        exists = (folder / _DESCRIPTION).is_file()
-        dtype = Records.open(folder).dtype if exists else "float16"
     grid = frames.grid
     source: dict[str, Any] = {"grid": grid.to_dict()}
     if frames.reader_version is not None:

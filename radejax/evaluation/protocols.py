@@ -12,7 +12,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Real
 
-from radejax.core.errors import UserError, require
+from radejax.core.config import find_part
+from radejax.core.errors import require
 
 EMPTY_FRAMES = ("protocol", "class", "frame", "none")
 """Rules for the frames to ignore, see `evaluate`."""
@@ -86,7 +87,7 @@ PROTOCOLS = {protocol.name: protocol for protocol in _ALL}
 
 
 def get_protocol(name: str) -> Protocol:
-    """Returns the protocol of a name.
+    """Returns the protocol of a name, or of "module:Object", which is then its name.
 
     Raises:
         UserError: There is no such protocol; the message lists all.
@@ -95,9 +96,8 @@ def get_protocol(name: str) -> Protocol:
         >>> get_protocol("kradar_r40").name
         'kradar_r40'
     """
-    if name not in PROTOCOLS:
-        raise UserError(f"unknown protocol {name!r}; known: {', '.join(PROTOCOLS)}")
-    return PROTOCOLS[name]
+    found = find_part(name, "protocols", PROTOCOLS, Protocol)
+    return dataclasses.replace(found, name=name)
 
 
 @dataclasses.dataclass(frozen=True)

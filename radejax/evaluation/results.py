@@ -36,11 +36,7 @@ LEVEL = 0.95
 
 _RANGES = {
     "iou_thresholds": several(BELOW_ONE, "different numbers in [0, 1)", least=1),
-    "protocols": several(
-        one_of(*protocols.PROTOCOLS),
-        f"different ones of {', '.join(protocols.PROTOCOLS)}",
-        least=1,
-    ),
+    "protocols": several((bool, ""), "different names, such as all_point", least=1),
     "score_threshold": number(0, 1),
     "empty_frames": one_of(*protocols.EMPTY_FRAMES),
     "min_score": number(0, 1),
@@ -93,6 +89,8 @@ class EvaluationOptions:
     def __post_init__(self) -> None:
         check_options(vars(self), "config.evaluation", _RANGES)
         try:
+            for name in self.protocols:
+                protocols.get_protocol(name)
             roi_bounds(self.roi)
         except UserError as error:
             raise UserError(f"config.evaluation.{error}") from None
@@ -346,7 +344,7 @@ def condition_masks(frames: AnyColumns, kind: str) -> dict[str, Bool[np.ndarray,
 
 def exclusion_counts(data: EvaluationSet, options: EvaluationOptions) -> dict[str, int]:
     """Counts the boxes and frames that are excluded from the results, by reason."""
-    fixed = [p for p in options.protocols if protocols.PROTOCOLS[p].is_fixed]
+    fixed = [p for p in options.protocols if protocols.get_protocol(p).is_fixed]
     threshold = max(options.score_threshold, options.min_score)
     is_kept = data.score > threshold
     but = f" (counted by {', '.join(fixed)})" if threshold > options.min_score else ""

@@ -22,11 +22,11 @@ import tqdm
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.core.structures import BOX_FIELDS, Detections, frame_key
-from radejax.data.dataset import data_set
+from radejax.data.dataset import FrameSequence, data_set
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.conditions import check_weather, read_description
 from radejax.data.kradar.dataset import sequence_number
-from radejax.data.pipeline import camera_inputs, frame_histories
+from radejax.data.pipeline import camera_inputs, frame_histories, require_images
 from radejax.data.reduced import is_reduced_file
 from radejax.evaluation import kitti
 from radejax.geometry.camera import Camera
@@ -96,6 +96,7 @@ def front_images(
     detector: Detector,
     labels: str | os.PathLike | None = None,
     version: str = "v2.1",
+    camera_calibration: str | os.PathLike | None = None,
     roots: Sequence[str | os.PathLike] = (),
 ) -> dict[pathlib.Path, tuple[pathlib.Path, Camera]]:
     """Find the images and cameras of frames.
@@ -106,6 +107,7 @@ def front_images(
         labels: Label revision, see `KRadar`. If None, the label files of the sequences
             are used, and sequences without them have no images.
         version: Version of the labels.
+        camera_calibration: Folder of camera calibrations; None for those in the roots.
         roots: Files and folders in which `find_frames` searched. Folders of sequences
             without radar files may have their images and labels.
 
@@ -113,8 +115,8 @@ def front_images(
         Image file and camera by the path of the radar file, for the frames that have both.
 
     Raises:
-        UserError: The labels are of another version, or a calibration is for images of
-            another size than the model's.
+        UserError: The labels are of another version, there are images and no calibration,
+            or a calibration is for images of another size than the model's.
     """
     others = {
         files.as_path(root).absolute() for root in roots if files.as_path(root).is_dir()
@@ -136,16 +138,29 @@ def front_images(
         visibility=None,
         field_of_view=False,
         sequence_numbers={int(folder.name) for folder in sequences},
+        camera_calibration=camera_calibration,
         common_camera=detector.camera_options.calibration == "common",
     )
-    options = dataclasses.replace(detector.camera_options, allow_missing=True)
-    cameras = camera_inputs(frames, detector.model.image_size, options).cameras
+    cameras = _cameras(frames, detector)
     return {
         path: (frame.camera_path, camera)
         for frame, camera in zip(frames, cameras, strict=True)
         for path in (frame.tesseract_path, frame.projection_path)
         if path is not None and frame.camera_path is not None and camera.is_valid
     }
+
+
+def _cameras(frames: FrameSequence, detector: Detector) -> Sequence[Camera]:
+    """Return the camera of every frame.
+
+    Raises:
+        UserError: There are images, and no calibration for any of them.
+    """
+    options = dataclasses.replace(detector.camera_options, allow_missing=True)
+    inputs = camera_inputs(frames, detector.model.image_size, options)
+    if any(frame.camera_path is not None for frame in frames):
+        require_images(frames, inputs, "dataset")
+    return inputs.cameras
 
 
 def detect_files(
@@ -159,6 +174,7 @@ def detect_files(
     sequence_numbers: Sequence[int] | None = None,
     weather: Sequence[str] | None = None,
     labels: str | os.PathLike | None = None,
+    camera_calibration: str | os.PathLike | None = None,
     image_backbone: str | os.PathLike | None = None,
     **settings: Any,
 ) -> dict[str, int]:
@@ -180,6 +196,7 @@ def detect_files(
         weather: Kinds of weather to take, see `find_frames`.
         labels: Label revision in which a radar-camera model's images are looked up; the
             revision that the run was trained with if None.
+        camera_calibration: Folder of camera calibrations; that of the run if None.
         image_backbone: Weights of the image backbone, see `Detector.from_workdir`.
         **settings: `score_threshold`, `nms_iou` and `roi` of the detector.
 
@@ -191,8 +208,9 @@ def detect_files(
 
     Raises:
         FileNotFoundError: A path does not exist.
-        UserError: There is no frame, two frames would be written to the same file, or an
-            image or weight is not as expected.
+        UserError: There is no frame, two frames would be written to the same file, a
+            radar-camera model has images without any calibration, or an image or weight is
+            not as expected.
     """
     needed = ("pandas", "pyarrow") if file_format == "parquet" else ()
     if lacking := [name for name in needed if importlib.util.find_spec(name) is None]:
@@ -202,7 +220,10 @@ def detect_files(
     detector = Detector.from_workdir(source, step, image_backbone=image_backbone)
     is_kradar = detector.saved.config.data.format == "kradar"
     read, part = _files if is_kradar else _frames, (sequence_numbers, weather)
-    keys, inputs = read(paths, *part, detector, labels)
+    data = detector.saved.config.data
+    labels = labels or data.labels
+    calibration = camera_calibration or data.camera_calibration
+    keys, inputs = read(paths, *part, detector, labels, calibration)
     out = files.as_path(out)
     out.mkdir(parents=True, exist_ok=True)
     names = [f"{key.replace('/', '_')}.json" for key in keys]
@@ -259,6 +280,7 @@ def _files(
     weather: Sequence[str] | None,
     detector: Detector,
     labels: str | os.PathLike | None,
+    camera_calibration: str | os.PathLike | None,
 ) -> tuple[list[str], Callable[[slice], Any]]:
     """Return the keys of K-Radar's frames, and a function that reads a batch of inputs."""
     frames = find_frames(paths, sequence_numbers, weather)
@@ -271,11 +293,12 @@ def _files(
             )
     if detector.num_frames > 1:  # folders of tensors and of projections may be mixed
         frames.sort(key=key_of)
-    keys, data = [key_of(path) for path in frames], detector.saved.config.data
+    keys = [key_of(path) for path in frames]
+    version = detector.saved.config.data.label_version
     known: dict[pathlib.Path, tuple[pathlib.Path, Camera]] = {}
     if detector.takes_camera:
-        labels = labels or data.labels
-        known = front_images(frames, detector, labels, data.label_version, paths)
+        own = camera_calibration
+        known = front_images(frames, detector, labels, version, own, paths)
     if not known:
         return keys, lambda batch: frames[batch]
     images = [known.get(path.absolute(), (None, None)) for path in frames]
@@ -288,13 +311,15 @@ def _frames(
     weather: Sequence[str] | None,
     detector: Detector,
     labels: str | os.PathLike | None,
+    camera_calibration: str | os.PathLike | None,
 ) -> tuple[list[str], Callable[[slice], Any]]:
     """Return the same as `_files` from the reader of the run's own format."""
     config = detector.saved.config
     frames = data_set(config.data.format)(
         list(map(str, roots)),
-        labels or config.data.labels,
+        labels,
         classes=config.classes,
+        camera_calibration=camera_calibration,
         sequence_numbers=sequence_numbers,
         weather=weather,
     ).part(sequence_numbers, weather)
@@ -305,11 +330,9 @@ def _frames(
         raise UserError(f"{roots[0]}: the radar has other axes than that of the run")
     images: list[Any] = []
     if detector.takes_camera:
-        options = dataclasses.replace(detector.camera_options, allow_missing=True)
-        cameras = camera_inputs(frames, detector.model.image_size, options).cameras
         images = [
             (frame.camera_path, camera) if camera.is_valid else (None, None)
-            for frame, camera in zip(frames, cameras, strict=True)
+            for frame, camera in zip(frames, _cameras(frames, detector), strict=True)
         ]
 
     def read(batch: slice) -> Any:

@@ -141,6 +141,9 @@ def export(
     }
 
 
+_NAMES = {"radenet": "RADE-Net", "dinorade": "DinoRADE"}
+
+
 def _readme(detector: Detector, shape: Sequence[int], left_out: Sequence[str]) -> str:
     """Return the text of the model card."""
     radar = f"Projections [B, {', '.join(map(str, shape))}] float32"
@@ -149,7 +152,7 @@ def _readme(detector: Detector, shape: Sequence[int], left_out: Sequence[str]) -
     config = detector.saved.config
     is_simulated = (config.get("simulation") or {}).get("scenes") == "procedural"
     return _MODEL_CARD.read_text().format(
-        name={"radenet": "RADE-Net", "dinorade": "DinoRADE"}[config.model.name],
+        name=_NAMES.get(config.model.name, config.model.name),
         classes=", ".join(detector.classes),
         input=f"{radar}, B frames.",
         radejax=radejax.__version__,

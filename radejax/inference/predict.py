@@ -118,7 +118,7 @@ def embed_dataset(
     frames: Sequence[LabelledFrame],
     folder: str | os.PathLike,
     *,
-    dtype: str = "float32",
+    dtype: str | None = None,
     resize: bool = False,
     batch_size: int = 8,
 ) -> dict[str, int]:
@@ -132,7 +132,8 @@ def embed_dataset(
         frames: Frames of a dataset, normally of all splits.
         folder: Folder of the embeddings, created if missing.
         dtype: Dtype of the stored features: "float32", with which training gives the same
-            results as with images, or "float16", which needs half the space.
+            results as with images, or "float16", which needs half the space. None for
+            that of existing ones, or float32 without any.
         resize: Resize images of another size to the model's size.
         batch_size: Number of images per batch.
 
@@ -152,7 +153,7 @@ def embed_dataset(
         "image": embedding_fields(image_config),
         "weights_sha256": weights_sha256(params),
     }
-    records = Records.create(folder, model.feature_shape, dtype, source)
+    records = Records.create(folder, model.feature_shape, dtype, source, "float32")
     keys = records.keys()
     images = [f for f in frames if f.camera_path is not None and f.key not in keys]
     found = sum(frame.key in keys for frame in frames)
@@ -176,7 +177,9 @@ def embed_dataset(
     with tqdm.tqdm(total=len(images), desc="embed") as bar:
         for i, batch in enumerate(batches):
             empty = [(0, batch_size - len(batch)), (0, 0), (0, 0), (0, 0)]
-            features = np.asarray(embed(params, np.pad(batch, empty))).astype(dtype)
+            features = np.asarray(embed(params, np.pad(batch, empty))).astype(
+                records.dtype
+            )
             for row, frame in enumerate(images[i * batch_size :][: len(batch)]):
                 records.write(frame.key, features[row])
             bar.update(len(batch))

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int, Num
 
+from radejax.core.config import find_part
 from radejax.core.errors import POSITIVE, Range, check_options, one_of
 from radejax.core.structures import Batch, DetectionMaps
 from radejax.detection.decode import DecodeOptions, find_peaks, suppress
@@ -46,8 +47,9 @@ class LossOptions:
         assignment: "center" compares each object with the prediction at its own bin, as in
             the released code. "nms" compares predictions that survive NMS with the object
             that they overlap most, as in the paper.
-        weights: Weights of the losses by their name in `LOSSES`. A loss without a weight
-            is not computed.
+        own_terms: Losses besides `LOSSES`, each as "module:function".
+        weights: Weights of the losses by their name in `LOSSES`, or by the name of a
+            function of `own_terms`. A loss without a weight is not computed.
         normalize: Whether to divide each loss by its own value, without a gradient through
             the divisor. Each loss that is not 0 then contributes its weight to the total,
             whatever its value.
@@ -64,6 +66,7 @@ class LossOptions:
     gwd_tau: float = 1.65
     normalize_yaw: bool = False
     assignment: Assignment = "center"
+    own_terms: tuple[str, ...] = ()
     weights: Mapping[str, float] = dataclasses.field(
         default_factory=lambda: {"focal": 2.0, "gwd": 1.0, "smooth_l1": 1.0}
     )
@@ -71,7 +74,8 @@ class LossOptions:
     decoding: DecodeOptions = DecodeOptions()  # noqa: RUF009, immutable
 
     def __post_init__(self) -> None:
-        names = ", ".join(LOSSES)
+        terms = self.terms
+        own = terms.keys() - LOSSES.keys()
         ranges: dict[str, Range] = {
             "heatmap_sigma_mode": one_of(*get_args(SigmaMode)),
             "heatmap_sigma_bins": POSITIVE,
@@ -79,17 +83,28 @@ class LossOptions:
             "gwd_tau": POSITIVE,
             "assignment": one_of(*get_args(Assignment)),
             "weights": (
-                _are_weights,
-                f"numbers of at least 0, not all 0, for some of {names}",
+                lambda weights: (
+                    own <= set(weights) <= set(terms) and _are_weights(weights)
+                ),
+                f"numbers of at least 0, not all 0, for some of {', '.join(terms)}, and "
+                "for all of own_terms",
             ),
         }
         check_options(vars(self), "config.loss", ranges)
 
+    @property
+    def terms(self) -> dict[str, Callable[..., Float[jax.Array, ""]]]:
+        """All losses by the names that `weights` has."""
+        own = {
+            place.partition(":")[2]: find_part(place, "config.loss.own_terms", {})
+            for place in self.own_terms
+        }
+        return LOSSES | own
+
 
 def _are_weights(weights: Mapping[str, float]) -> bool:
     numbers = weights.values()
-    are_in_range = all(0 <= weight < math.inf for weight in numbers)
-    return set(weights) <= set(LOSSES) and are_in_range and any(numbers)
+    return all(0 <= weight < math.inf for weight in numbers) and any(numbers)
 
 
 def detection_loss(
@@ -161,7 +176,7 @@ def detection_loss(
         jnp.where(row, expected, 1.0),
         is_matched,
     )
-    terms = {name: LOSSES[name](pairs, chosen) for name in chosen.weights}
+    terms = {name: chosen.terms[name](pairs, chosen) for name in chosen.weights}
     total = _weighted_sum(terms, chosen.weights, chosen.normalize)
     terms["weighted_sum"] = _weighted_sum(terms, chosen.weights, False)
     counted = {"objects": is_valid, "positive": target >= 1, "matched": is_matched}
@@ -214,7 +229,7 @@ def _smooth_l1(pairs: Pairs, options: LossOptions) -> Float[jax.Array, ""]:
     return pairs.mean(jnp.mean(smooth_l1(pairs.predicted - pairs.expected), -1))
 
 
-LOSSES: dict[str, Callable[[Pairs, LossOptions], Float[jax.Array, ""]]] = {
+LOSSES: dict[str, Callable[..., Float[jax.Array, ""]]] = {
     "focal": _focal,
     "gwd": _gwd,
     "smooth_l1": _smooth_l1,

@@ -8,6 +8,7 @@ from typing import Any
 
 import flax.linen as nn
 
+from radejax.core.config import find_part
 from radejax.core.errors import UserError, check_options, one_of
 from radejax.geometry.radar_grid import AzimuthMapping, RadarGrid
 from radejax.models.dinorade import DinoRade
@@ -16,15 +17,17 @@ from radejax.models.lifting import LiftingAxes
 from radejax.models.radenet import RadeNet
 from radejax.models.vit import ViT
 
+_MODELS = {"radenet": RadeNet, "dinorade": DinoRade}
+
 
 def build(config: Mapping[str, Any], num_frames: int = 1) -> nn.Module:
     """Creates the model that `config.model` describes.
 
     Args:
-        config: A mapping with `name`, "radenet" or "dinorade", and exactly the fields of
-            that model. The fields of RADE-Net are the attributes of `RadeNet`, where `cbam`
-            may be "off". DinoRADE additionally has the sections `image`, `fusion` and
-            `query_grid`.
+        config: A mapping with `name`, "radenet", "dinorade" or "module:Class" of a class
+            derived from either, and exactly the fields of that model. The fields of RADE-Net
+            are the attributes of `RadeNet`, where `cbam` may be "off". DinoRADE additionally
+            has the sections `image`, `fusion` and `query_grid`.
         num_frames: `config.data.num_frames`, the number of frames of a sample.
 
     Returns:
@@ -35,16 +38,18 @@ def build(config: Mapping[str, Any], num_frames: int = 1) -> nn.Module:
             has the wrong type.
     """
     fields = _plain(config)
-    fields.setdefault("name", None)
-    check_options(fields, "config.model", {"name": one_of("radenet", "dinorade")})
-    is_camera = fields.pop("name") == "dinorade"
-    sections = ("image", "fusion", "query_grid") if is_camera else ()
-    _check_keys(fields, {*_own_fields(RadeNet), *sections} - {"num_frames"}, "")
+    name = fields.pop("name", None)
+    module = find_part(name, "config.model.name", _MODELS, RadeNet)
+    expected, is_camera = _own_fields(module), issubclass(module, DinoRade)
+    if is_camera:
+        expected -= _own_fields(DinoRade) - _own_fields(RadeNet)
+        expected |= {"image", "fusion", "query_grid"}
+    _check_keys(fields, expected - {"num_frames"}, "")
     fields["num_frames"] = num_frames
     if fields["cbam"] == "off":
         fields["cbam"] = None
     try:
-        return DinoRade(**_with_camera(fields)) if is_camera else RadeNet(**fields)
+        return module(**(_with_camera(fields) if is_camera else fields))
     except TypeError as error:
         raise UserError(f"config.model has a value of a wrong type: {error}") from None
 

@@ -19,6 +19,7 @@ from typing import Any
 import flax.linen as nn
 import jax.numpy as jnp
 
+from radejax.core.config import find_part
 from radejax.core.structures import DetectionMaps
 from radejax.models.layers import Conv, ConvGNSiLU, Features, GroupNorm, Map
 
@@ -145,7 +146,7 @@ class Heads(nn.Module):
 
     Attributes:
         num_classes: Channels of the heatmap.
-        kind: Name of the heads' type in `HEADS`.
+        kind: Name of the heads' type in `HEADS`, or "module:Class".
         num_groups: Groups of the normalizations.
         dtype: Dtype of the computation up to the last convolution.
         remat: Recompute blocks in the backward pass instead of storing them.
@@ -163,7 +164,7 @@ class Heads(nn.Module):
     @nn.compact
     def __call__(self, x: Map) -> DetectionMaps:
         head = functools.partial(
-            HEADS[self.kind],
+            find_part(self.kind, "config.model.heads", HEADS),
             num_groups=self.num_groups,
             dtype=self.dtype,
             remat=self.remat,

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
+from radejax.core.config import find_part
 from radejax.core.errors import (
     POSITIVE,
     SIZE,
@@ -24,8 +25,8 @@ from radejax.core.errors import (
     require,
 )
 from radejax.core.structures import DetectionMaps
-from radejax.models.backbone import BACKBONES, CBAMKind
-from radejax.models.heads import HEADS, NECKS, Heads
+from radejax.models.backbone import BACKBONES, Backbone, CBAMKind
+from radejax.models.heads import HEADS, NECKS, Head, Heads, Neck
 from radejax.models.layers import Map
 
 Projection = Float[jax.Array, "B R A DE"]
@@ -53,7 +54,7 @@ class RadeNet(nn.Module):
         num_groups: Groups of every normalization; must divide every width.
         cbam: "official", "paper" or None; see `radejax.models.backbone.CBAM`.
         input_stem: Whether to encode Doppler and elevation separately first.
-        backbone, neck, heads: Names in `BACKBONES`, `NECKS` and `HEADS`.
+        backbone, neck, heads: Names in `BACKBONES`, `NECKS` and `HEADS`, or "module:Class".
         pad_multiple: Multiple to which range and azimuth are padded; must be a multiple of
             2 ** len(widths).
         crop_output: Whether to crop the maps to the projection's bins.
@@ -102,9 +103,6 @@ class RadeNet(nn.Module):
                 "one or several integers of at least 1",
             ),
             "cbam": one_of("official", "paper", None),
-            "backbone": one_of(*BACKBONES),
-            "neck": one_of(*NECKS),
-            "heads": one_of(*HEADS),
             "dtype": one_of("float32", "bfloat16"),
             "remat": one_of(*REMAT),
             "heatmap_prior": (lambda prior: 0 < prior < 1, "a number in (0, 1)"),
@@ -112,6 +110,9 @@ class RadeNet(nn.Module):
             "input_scale": POSITIVE,
         }
         check_options(vars(self), "config.model", ranges)
+        find_part(self.backbone, "config.model.backbone", BACKBONES, Backbone)
+        find_part(self.neck, "config.model.neck", NECKS, Neck)
+        find_part(self.heads, "config.model.heads", HEADS, Head)
         least = "above 0 if config.model.doppler_bins is 0"
         is_some = self.doppler_bins + self.elevation_bins > 0
         require(is_some, "config.model.elevation_bins", self.elevation_bins, least)
@@ -177,7 +178,8 @@ class RadeNet(nn.Module):
 
     def _features(self, padded: Projection) -> Map:
         """Applies the backbone."""
-        return self._stage(BACKBONES[self.backbone])(
+        backbone = find_part(self.backbone, "config.model.backbone", BACKBONES)
+        return self._stage(backbone)(
             doppler_bins=self.num_frames * self.doppler_bins,
             widths=self.widths,
             decoder_width=self.decoder_width,
@@ -191,7 +193,7 @@ class RadeNet(nn.Module):
         self, features: Float[jax.Array, "B Rp Ap C"], projection: Projection
     ) -> DetectionMaps:
         """Applies neck and heads, and crops the maps if `crop_output`."""
-        neck = self._stage(NECKS[self.neck])(**self._shared(), name="neck")
+        neck = self._stage(find_part(self.neck, "config.model.neck", NECKS))
         heads = self._stage(Heads)(
             num_classes=self.num_classes,
             kind=self.heads,
@@ -199,7 +201,7 @@ class RadeNet(nn.Module):
             **self._shared(),
             name="heads",
         )
-        maps = heads(neck(features))
+        maps = heads(neck(**self._shared(), name="neck")(features))
         if not self.crop_output:
             return maps
         r, a = projection.shape[1:3]

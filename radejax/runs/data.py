@@ -326,6 +326,13 @@ def open_data(config: ConfigDict, model: nn.Module) -> Data:
     simulate_missing(config)
     data = Data(config, model)
     _log.info("%s", data.frames.summary().to_text())
+    used = {f.key for name in ("train", "test") for f in data.frames.of_split(name)}
+    if unused := [frame.key for frame in data.split("all") if frame.key not in used]:
+        _log.warning(
+            "%d frames are not used, as they are in neither the train nor the test split; "
+            "the first is %s",
+            *(len(unused), unused[0]),
+        )
     # Preprocessing can take hours, so the data are checked before it.
     check_bins(config.model, data.frames.grid, f"the radar of {data.options.roots[0]}")
     frames = data.split("train")

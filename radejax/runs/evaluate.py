@@ -28,7 +28,6 @@ from radejax.evaluation.results import EvaluationOptions, evaluate_tables
 from radejax.inference.detector import Detector, check_backbone
 from radejax.inference.predict import predict_dataset
 from radejax.inference.saved import PathLike, SavedModel, Step, load_model
-from radejax.losses.detection import LOSSES
 from radejax.runs import figures
 from radejax.runs.data import Data, data_name, data_of_run
 from radejax.training import distributed
@@ -205,7 +204,7 @@ class Evaluation:
             save_figure(draw_scenes(scenes), folder / f"scenes.{ending}")
         if (workdir / "metrics.jsonl").exists():
             series = curves.read_metrics(workdir / "metrics.jsonl")
-            if losses := [name for name in LOSSES if name in series]:
+            if losses := [n for n in self._config.loss.weights if n in series]:
                 figure = curves.draw_training(series, losses, workdir.name + suffix)
                 save_figure(figure, folder / f"training.{ending}")
 
@@ -319,7 +318,7 @@ def evaluate_run(
     if other is not None:
         frames = data.split(split)
         images = data.images(frames)
-        require_images(frames, images, split)
+        require_images(frames, images, f"{split} split")
         if images is not None:
             check_backbone(images.empty_images(1), saved.variables)
         if out is None:

@@ -19,7 +19,6 @@ from ml_collections import ConfigDict
 
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
-from radejax.losses.detection import LOSSES
 from radejax.training import distributed
 
 
@@ -68,6 +67,7 @@ class MetricLogger:
         is_main = distributed.is_main()
         self._path = folder / "metrics.jsonl"
         self._frames_per_step = config.train.batch_size
+        self._losses = tuple(config.loss.weights)
         self._board, self._wandb = None, None
         if is_main:
             if self._path.exists():
@@ -130,7 +130,7 @@ class MetricLogger:
             epoch: Number of epochs at the step, with a fraction.
         """
         values = {k: float(np.asarray(v)) for k, v in metrics.items()}
-        text = [f"{k} {v:.4g}" for k, v in values.items() if k in LOSSES]
+        text = [f"{k} {v:.4g}" for k, v in values.items() if k in self._losses]
         elapsed, steps = time.perf_counter() - self._since, step - self._last_step
         if steps:
             values["frames_per_s"] = steps * self._frames_per_step / elapsed

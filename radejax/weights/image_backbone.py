@@ -67,8 +67,7 @@ def load_image_backbone(
         return None
     if not has_camera:
         raise UserError(
-            "image backbone weights are given, but config.model.name is 'radenet', "
-            "which has no camera"
+            f"image backbone weights are given, but {type(model).__name__} has no camera"
         )
     if model.vit is None:
         part = load_resnet(path, model)

@@ -1,6 +1,7 @@
 """Frames on radar and camera, and in a recording."""
 
 import pathlib
+import shutil
 
 import click.testing
 import numpy as np
@@ -22,6 +23,13 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     config = default_config()
     config.update(train_sequences=1, test_sequences=0, frames_per_sequence=1)
     return simulate_dataset(config, folder, progress=False)
+
+
+@pytest.fixture
+def without_calibration(root: pathlib.Path, tmp_path: pathlib.Path) -> pathlib.Path:
+    """A copy of the sequence, as on K-Radar's disks."""
+    ignore = shutil.ignore_patterns("calib")
+    return pathlib.Path(shutil.copytree(root, tmp_path / "disk", ignore=ignore))
 
 
 def _run(name: str, root: object, *arguments: object) -> click.testing.Result:
@@ -74,6 +82,29 @@ def test_slices_and_a_sequence_in_motion(
     assert done.exit_code == 0, done.output
     with Image.open(tmp_path / "all.gif") as picture:
         assert picture.format == "GIF"
+
+
+def test_boxes_that_cannot_be_drawn_on_the_image_are_reported(
+    root: pathlib.Path, without_calibration: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    out, given = tmp_path / "a.png", ("--camera-calibration", root / "calib")
+    done = _run("1", root, "--out", out)
+    assert done.output == f"drew {out}\n"
+    complete = out.read_bytes()
+    done = _run("1", without_calibration, "--out", out)
+    assert done.exit_code == 0, done.output
+    assert "0 of 1 frames have no front image, 1 no camera calib" in done.output
+    assert "--camera-calibration FOLDER" in done.output
+    assert out.read_bytes() != complete
+    done = _run("1", without_calibration, "--out", out, *given)
+    assert done.output == f"drew {out}\n"
+    assert out.read_bytes() == complete
+    (image,) = without_calibration.glob("1/cam-front/*")
+    image.unlink()
+    done = _run("1", without_calibration, "--out", out, *given)
+    assert "1 of 1 frames have no front image, 0 no camera calib" in done.output
+    done = _run("1", without_calibration, "--out", out, "--slices")
+    assert done.output == f"drew {out}\n"
 
 
 def test_a_part_of_the_data_is_drawn(

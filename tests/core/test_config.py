@@ -12,6 +12,7 @@ from radejax.core.config import (
     base_config,
     config_file,
     config_name,
+    find_part,
     load_config,
     load_module,
     override,
@@ -30,6 +31,28 @@ def _get(name: str, words: str | None = None) -> Any:
 def _fields(config: Any) -> set[str]:
     flat = config.to_dict()
     return {f"{s}.{f}" for s, v in flat.items() if isinstance(v, dict) for f in v}
+
+
+def test_parts_are_known_or_imported_and_of_one_kind() -> None:
+    known = {"floats": float}
+    assert find_part("floats", "config.x", known, float) is float
+    assert (
+        find_part("pathlib:Path", "config.x", known, pathlib.PurePath) is pathlib.Path
+    )
+    assert find_part("math:pi", "config.x", {}, float) > 3
+    for name, message in (
+        ("floats:", r"is 'floats:', expected 'floats' or module:Object"),
+        (":Path", r"is ':Path', expected 'floats' or module:Object"),
+        (None, r"is None, expected 'floats' or module:Object"),
+        (
+            "pathlib:Paths",
+            "no attribute 'Paths'; run this in the folder of pathlib",
+        ),
+        ("no.such:Thing", "No module named 'no'"),
+        ("pathlib:Path", "is 'pathlib:Path', expected the name of a float"),
+    ):
+        with pytest.raises(UserError, match=rf"^config\.x .*{message}"):
+            find_part(name, "config.x", known, float)
 
 
 @pytest.mark.parametrize(

@@ -310,6 +310,15 @@ def test_a_folder_has_records_of_one_kind(data, tmp_path):
         run(LabelledFrames(data, RadarGrid.kradar()), tmp_path)
 
 
+def test_a_folder_of_a_failed_call_is_used(data, tmp_path):
+    Records.create(tmp_path, (2, 3), "uint8", {"image": {}})
+    records = Records.create(tmp_path, (2, 4), None, {}, "float32")
+    assert (records.shape, records.dtype) == ((2, 4), "uint8")
+    assert run(data, tmp_path, dtype="float16").num_written == len(data)
+    with pytest.raises(UserError, match=r"other records: .*shape is"):
+        Records.create(tmp_path, (2, 4), "float16", {})
+
+
 def test_wrong_arguments(data, tmp_path):
     with pytest.raises(UserError, match="no frames to preprocess"):
         run(LabelledFrames([], data.grid), tmp_path)

@@ -481,7 +481,7 @@ def test_weights_repeat_frames(random_scene):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"protocol": "r40"}, "unknown protocol 'r40'; known: kradar_r40"),
+        ({"protocol": "r40"}, "protocols is 'r40', expected 'kradar_r40' or"),
         ({"spaces": "2d"}, "spaces is .* expected some of"),
         ({"empty_frames": "all"}, "empty_frames is 'all', expected one of"),
         ({"roi": "wider"}, "roi is 'wider', expected one of narrow, wide"),

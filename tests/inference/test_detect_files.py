@@ -176,3 +176,14 @@ def test_images_of_simulated_folders_are_found(tmp_path):
     assert found == path.absolute()
     assert image.parent.name == "cam-front"
     assert camera.is_valid
+
+    # K-Radar's disks have no camera calibration; its repository does.
+    folder = (root / "calib").rename(tmp_path / "repository")
+    with pytest.raises(
+        UserError, match=r"1 no camera calib.*--camera-calibration FOLD"
+    ):
+        front_images([path], detector)
+    known = front_images([path], detector, camera_calibration=folder)
+    np.testing.assert_array_equal(known[found][1].intrinsics, camera.intrinsics)
+    image.unlink()
+    assert front_images([path], detector) == {}  # only the radar can be used

@@ -182,6 +182,32 @@ def test_frames_without_a_radar_tensor_that_can_be_read_are_left_out(
     assert len(part.split("all")) == 3
 
 
+def test_frames_that_are_in_no_split_are_counted(
+    root: pathlib.Path, tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    disk = tmp_path / "disk2"
+    (disk / "split").mkdir(parents=True)
+    for number in "23":  # of the train and of the test split
+        shutil.move(root / number, disk / number)
+    entries = (root / "split" / "train.txt").read_text().splitlines(keepends=True)
+    for folder, number in ((root, "1,"), (disk, "2,")):
+        own = [line for line in entries if line.startswith(number)]
+        (folder / "split" / "train.txt").write_text("".join(own))
+    test = (root / "split" / "test.txt").rename(disk / "split" / "test.txt")
+    with caplog.at_level("WARNING", "radejax"):
+        data = _open(_config(root, disk))
+    assert [frame.sequence for frame in data.split("train")] == [1, 1, 2, 2]
+    assert [frame.sequence for frame in data.split("test")] == [3, 3]
+    assert "not used" not in caplog.text
+    (disk / "split" / "train.txt").unlink()
+    test.write_text(test.read_text().splitlines()[0])
+    with caplog.at_level("WARNING", "radejax"):
+        _open(_config(root, disk))
+    assert "3 frames are not used, as they are in neither the train nor" in caplog.text
+    first = next(frame.key for frame in data.split("train") if frame.sequence == 2)
+    assert f"the first is {first}" in caplog.text
+
+
 def test_a_run_is_evaluated_on_its_part_or_on_all_of_other_folders(
     root: pathlib.Path, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

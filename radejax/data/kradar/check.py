@@ -93,6 +93,7 @@ def check_dataset(
     version: str = "v2.1",
     sequence_numbers: Sequence[int] | None = None,
     weather: Sequence[str] | None = None,
+    camera_calibration: PathLike | None = None,
     deep: bool = False,
     progress: bool = False,
 ) -> HealthReport:
@@ -108,6 +109,7 @@ def check_dataset(
         version: Version of the labels.
         sequence_numbers: Sequences to check, or None for all.
         weather: Weathers of the sequences to check, or None for all.
+        camera_calibration: Folder of camera calibrations, or None for those in the roots.
         deep: Whether to read and project every radar tensor, which finds all corruption
             and takes hours.
         progress: Whether to show a progress bar.
@@ -124,6 +126,7 @@ def check_dataset(
         version=version,
         sequence_numbers=sequence_numbers,
         weather=weather,
+        camera_calibration=camera_calibration,
     )
     summary, splits = data.summary(), _find_splits(data)
     groups = itertools.groupby(data, key=lambda frame: frame.sequence)

@@ -109,9 +109,9 @@ class KRadar(LabelledFrames[Frame]):
         version: Version of these labels: v1.0, v1.1, v2.0 or v2.1.
         split: "train" or "test", the path of a split file, or None for every frame.
             The official split files are searched as `<split>.txt` in `split/`,
-            `resources/split/` and the top level of the roots, of `labels` and of its
-            parent folder. Without them, K-Radar's rule (alternating quarters of every
-            sequence) is applied, which `summary()` notes.
+            `resources/split/` and the top level of every root, whose entries are merged,
+            or else of `labels` and of its parent folder. Without them, K-Radar's rule
+            (alternating quarters of every sequence) is applied, which `summary()` notes.
         visibility: Visibility flags of the objects to keep, or None for all.
         include_unstarred_v11_labels: Whether lines of v1.x labels without a `*` are
             objects too, as in the reference implementation.
@@ -315,18 +315,16 @@ class KRadar(LabelledFrames[Frame]):
                     f"split {split!r} is neither 'train', 'test', None nor a split file"
                 )
             return set(read_split(split))
-        paths = {
-            name: _first_file(
-                self._split_folders, [f"{place}/{name}.txt" for place in _SPLIT_FOLDERS]
-            )
-            for name in ("train", "test")
+        paths = {name: self._split_files(name) for name in ("train", "test")}
+        entries = {
+            n: set[Key]().union(*map(read_split, of)) for n, of in paths.items() if of
         }
-        entries = {name: set(read_split(path)) for name, path in paths.items() if path}
         if len(entries) == 2 and (both := sorted(entries["train"] & entries["test"])):
+            train, test = (", ".join(map(str, files)) for files in paths.values())
             message = (
                 f"{both[0][0]}/{both[0][1]}: the first of {len(both)} frames that are in "
-                f"both {paths['train']} and {paths['test']}; a model is evaluated on "
-                "frames that it was trained on"
+                f"both {train} and {test}; a model is evaluated on frames that it was "
+                "trained on"
             )
             self._report("split", message)
             _log.warning(message)
@@ -340,6 +338,13 @@ class KRadar(LabelledFrames[Frame]):
             for number, group in itertools.groupby(keys, key=lambda key: key[0])
             for name in split_by_rule([name for _, name in group], split)
         }
+
+    def _split_files(self, split: str) -> list[pathlib.Path]:
+        """Returns the files of a split: of every root, or else one beside the labels."""
+        names = [f"{place}/{split}.txt" for place in _SPLIT_FOLDERS]
+        files = [_first_file([folder], names) for folder in self._split_folders]
+        of_roots = list(filter(None, files[: len(self.roots)]))
+        return of_roots or list(filter(None, files))[:1]
 
     def _report(self, kind: str, message: str) -> None:
         self._summary.problems.append((kind, message))

@@ -35,6 +35,16 @@ def test_healthy_copy(root):
     assert len(plain["sequences"]) == 2
 
 
+def test_calibrations_of_the_repository_are_found(root, tmp_path):
+    path = tmp_path / "cam_calib" / "common" / "cam_front0.yml"
+    path.parent.mkdir(parents=True)
+    path.touch()
+    text = check_dataset(root).to_text()
+    assert "2  sequences without camera calibration" in text
+    text = check_dataset(root, camera_calibration=tmp_path / "cam_calib").to_text()
+    assert "2  sequences with the common camera calibration" in text
+
+
 def test_everything_that_is_wrong_is_named(root):
     tesseracts = root / "1/radar_tesseract"
     path = tesseracts / "tesseract_00005.mat"

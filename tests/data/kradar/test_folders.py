@@ -172,6 +172,32 @@ def test_split_files_and_camera_calibration_are_found(tmp_path):
     assert data.counts["sequences without camera calibration"] == 1
 
 
+def test_split_files_of_several_roots_are_merged(tmp_path):
+    a, b, c = roots = [tmp_path / name for name in "abc"]
+    for number, root in enumerate(roots, 1):
+        open_sequence(root, number)
+    touch(a / "split/train.txt", f"1,{LABEL}.txt")
+    touch(a / "split/test.txt", "")
+    touch(b / "resources/split/test.txt", f"2,{LABEL}.txt")
+    touch(tmp_path / "split/train.txt", f"3,{LABEL}.txt")
+
+    def sequences(split, labels=None, folders=roots):
+        return [f.sequence for f in KRadar(folders, labels, split=split)]
+
+    assert sequences("train") == [1]
+    assert sequences("test") == [2]
+    # The files next to the labels are read if no root has any.
+    labels = touch(tmp_path / f"labels/3/{LABEL}.txt", HEADER).parents[1]
+    assert sequences("train", labels, [c]) == [3]
+    assert sequences("train", labels) == []
+    touch(c / "split/train.txt", f"3,{LABEL}.txt\n2,{LABEL}.txt")
+    assert sequences("train") == [1, 2, 3]
+    problems = KRadar(roots, split="test").summary().problems
+    (message,) = [text for kind, text in problems if kind == "split"]
+    assert message.startswith(f"2/{LABEL}: the first of 1 frames that are in both")
+    assert f"{a}/split/train.txt, {c}/split/train.txt and {a}/split/test.txt" in message
+
+
 def test_height_of_the_radar_is_kradars_or_the_simulations(tmp_path):
     text = '{"config": {"radar_from_lidar_m": [-2.54, 0.3, %s]}}'
     assert open_sequence(tmp_path / "a")[0].radar_from_lidar_z_m == 0.7
