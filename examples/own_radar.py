@@ -135,11 +135,10 @@ def get_config() -> ConfigDict:
         widths=(16, 32, 64),
         decoder_width=16,
         num_groups=8,
-        heatmap_prior=0.02,  # about the share of bins with an object
-        input_center=0.515,  # the noise, see the log of a training
+        heatmap_prior=0.02,  # score of the untrained network
+        input_center=0.515,  # mean of the input, which training prints
         input_scale=20.0,
     )
-    config.data.mirror_probability = 0.5
     config.loss.heatmap_sigma_bins = 1.0  # by default 3 bins; less if bins are long
     config.train.update(batch_size=4, num_epochs=10, warmup_steps=20)
     config.evaluation.roi = None  # by default K-Radar's lane region, 6.4 m to each side

@@ -37,8 +37,8 @@ RELEASES = ("polar3d", "rpc")
 """Reduced releases, by the first part of the names of their files."""
 
 UNUSABLE_POINTS = (
-    "points [N, 4] of a Cartesian grid (sprdr) cannot be used, because they have neither "
-    "Doppler nor range, azimuth and elevation bins; download rdr_polar_3d or rpc files"
+    "points [N, 4] on a Cartesian grid have neither Doppler nor polar bins, which the "
+    "networks need; download rdr_polar_3d or rpc files instead"
 )
 
 POWER_UNIT = 1e13
@@ -108,10 +108,11 @@ def project_reduced(
         # So few rows at a time stay in the cache.
         bins, cells, rows = ..., frame, 16
         beams = np.arange(rows * grid.num_azimuth).reshape(rows, -1, 1)
-    _check_values(cells, grid, name)
+    _check_power(cells[0], name)
     if grid.num_doppler:
         first_mps, last_mps = map(float, grid.doppler_mps[[0, -1]])
         bins_per_mps = (grid.num_doppler - 1) / (last_mps - first_mps or 1.0)
+        limit_mps = 1.01 * max(abs(first_mps), abs(last_mps))  # means may be rounded
     for start in range(0, grid.num_range, rows):
         part = projection[start : start + rows]
         power, doppler = cells[:, start : start + rows]
@@ -120,6 +121,12 @@ def project_reduced(
         part[...] = lowest if frame.ndim > 2 else np.minimum(lowest, EMPTY_LEVEL)
         part[..., grid.num_doppler :][bins] = levels
         if grid.num_doppler:
+            is_far = ~(np.abs(doppler) <= limit_mps) & (power > 0)
+            if is_far.any():
+                raise DataError(
+                    f"{name}: mean Doppler of {doppler[is_far][0]:.3g} m/s, expected from "
+                    f"{-limit_mps:.3g} to {limit_mps:.3g}"
+                )
             channels = np.rint((doppler.astype(np.float32) - first_mps) * bins_per_mps)
             # fmin and fmax also replace NaN, which cells without power have.
             channels = np.fmax(np.fmin(channels, grid.num_doppler - 1), 0)
@@ -218,11 +225,8 @@ def check_layout(frame: Real[np.ndarray, "..."], grid: RadarGrid, name: str) -> 
         )
 
 
-def _check_values(
-    cells: Float[np.ndarray, "2 ..."], grid: RadarGrid, name: str
-) -> None:
-    """Raises a `DataError` if power or Doppler are not on the scale of the releases."""
-    power, doppler = cells
+def _check_power(power: Float[np.ndarray, "..."], name: str) -> None:
+    """Raises a `DataError` if powers are not on the scale of the releases."""
     low, high = float(power.min()), float(power.max())
     share = 0.0 if low else np.mean(power == 0)
     is_decibels = _MIN_DECIBELS < low <= high < 2 * low
@@ -230,18 +234,4 @@ def _check_values(
         raise DataError(
             f"{name}: powers from {low:.3g} to {high:.3g}, {share:.0%} of them 0; expected "
             f"linear power (not decibels) divided by {POWER_UNIT:g}, at most 5 % of them 0"
-        )
-    limit_mps = 1.01 * np.abs(grid.doppler_mps).max(
-        initial=0.0
-    )  # a mean may be rounded
-    if (
-        not grid.num_doppler
-        or -limit_mps <= doppler.min() <= doppler.max() <= limit_mps
-    ):
-        return
-    is_far = ~(np.abs(doppler) <= limit_mps) & (power > 0)
-    if is_far.any():
-        raise DataError(
-            f"{name}: mean Doppler of {doppler[is_far][0]:.3g} m/s, expected from "
-            f"{-limit_mps:.3g} to {limit_mps:.3g}"
         )

@@ -7,6 +7,7 @@ ego frame. No other module uses a bin size.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
@@ -59,6 +60,12 @@ def is_uniform(axis: Float[np.ndarray, " bins"]) -> bool:
         >>> is_uniform(np.arange(5.0)), is_uniform(np.sin(np.arange(5.0) / 5))
         (True, False)
     """
+    return _is_uniform(np.asarray(axis, np.float64).tobytes())
+
+
+@functools.lru_cache  # for positions on the host, which are converted in few microseconds
+def _is_uniform(content: bytes) -> bool:
+    axis = np.frombuffer(content)
     if axis.size < 3:
         return True
     even = np.linspace(axis[0], axis[-1], axis.size)

@@ -33,7 +33,7 @@ from radejax.data.projection import (
     stack_frames,
     to_log_scale,
 )
-from radejax.data.reduced import is_reduced, polar_shape, project_reduced
+from radejax.data.reduced import is_reduced, project_reduced
 from radejax.data.tesseract import read_frame
 from radejax.detection.decode import DecodeOptions, decode
 from radejax.geometry.camera import (
@@ -254,12 +254,12 @@ class Detector:
         """Detect the objects in one or more frames.
 
         Args:
-            frames: Projections `[B, R, A, D+E]`, tesseracts `[B, D, R, E, A]` in linear
-                power, or `polar3d` frames `[B, 2, R, A, E]`; a single frame without the
-                axis B, or points `[N, 11]`; the path of a file; or a list of arrays and
-                paths. Alternatively a `Batch`, whose image and camera are used. A model of
-                several frames takes consecutive frames, oldest first, on an axis of length
-                `num_frames` after B; a list is one sample.
+            frames: Projections `[B, R, A, D+E]` or tesseracts `[B, D, R, E, A]` in linear
+                power; a single frame without the axis B, which may also be of a reduced
+                release, `[2, R, A, E]` or `[N, 11]`; the path of a file; or a list of
+                such frames and paths. Alternatively a `Batch`, whose image and camera are
+                used. A model of several frames takes consecutive frames, oldest first, on
+                an axis of length `num_frames` after B; a list is one sample.
             image: Images for a radar-camera model: `[B, H, W, 3]` uint8, embedded images,
                 or a list of arrays, paths and None.
             camera: One calibration for all frames, or a list with one per frame.
@@ -281,7 +281,8 @@ class Detector:
             radar = self._read(frames, self.num_frames)
             if self.num_frames > 1:
                 shape = (-1, self.num_frames, *self.grid.projection_shape)
-                samples = np.moveaxis(_projections(radar).reshape(shape), 1, 0)
+                projections = _projections(radar, self.grid).reshape(shape)
+                samples = np.moveaxis(projections, 1, 0)
                 radar = stack_frames(list(samples), self.grid.num_doppler)
             image, camera, num_radar_only = camera_batch(
                 image, camera, len(radar), self.model, self.camera_options
@@ -359,7 +360,7 @@ class Detector:
             frames: Single frames as arrays or paths.
             history: The last T - 1 projections, or None at the start of a sequence.
         """
-        new, past = _projections(self._read(frames, 1)), self.num_frames - 1
+        new, past = _projections(self._read(frames, 1), self.grid), self.num_frames - 1
         if history is None:
             history = np.repeat(new[:1], past, axis=0)
         known = np.concatenate([history, new])
@@ -412,9 +413,13 @@ class Detector:
         return placed if is_cpu else jax.block_until_ready(placed)
 
 
-def _projections(radar: Real[Array, "B ..."]) -> Float[np.ndarray, "B R A DE"]:
+def _projections(
+    radar: Real[Array, "B ..."], grid: RadarGrid
+) -> Float[np.ndarray, "B R A DE"]:
     """Compute the float32 projections of tesseracts, or convert stored projections."""
-    return np.asarray(to_float(_project(radar) if radar.ndim == 5 else radar))
+    if radar.ndim == 5:
+        radar = grid.measured_channels(_project(radar))
+    return np.asarray(to_float(radar))
 
 
 def _padded(x: Shaped[Array, "b ..."], size: int) -> Shaped[Array, "{size} ..."]:
@@ -514,8 +519,6 @@ def _projected(frames: Any, grid: RadarGrid) -> Any:
     array = as_numbers(frames, "frames")
     if is_reduced(array, grid):
         return project_reduced(np.asarray(array), grid)
-    if array.shape[1:] == polar_shape(grid) != grid.shape_drea and len(array):
-        return np.stack([project_reduced(np.asarray(x), grid) for x in array])
     return array
 
 

@@ -147,7 +147,8 @@ class DinoRade(RadeNet, kw_only=True):
                 f"{'image' if image is None else 'camera'}: give both or none"
             )
         x = self._features(padded)
-        elevation = padded[..., -self.elevation_bins :]  # of the last frame
+        channels = padded.shape[-1] - self.elevation_bins
+        elevation = padded[..., channels:]  # of the last frame
         x = self.image_fusion(x, elevation, camera_map, reference, train=train)
         return self._maps(x, projection)
 

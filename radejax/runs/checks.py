@@ -165,9 +165,8 @@ def check_bins(model: ConfigDict, grid: RadarGrid, source: str) -> None:
 def _check_simulation(config: ConfigDict) -> None:
     if "simulation" not in config:
         return
-    if (
-        "num_range" in config.simulation.grid
-    ):  # not "kradar" and no fields of a RadarGrid
+    # It may also be "kradar", or the fields of a `RadarGrid`.
+    if "num_range" in config.simulation.grid:
         check_options(config.simulation.grid, "config.simulation.grid", _GRID)
     grid = SimulationConfig.from_mapping(config.simulation).make_grid()
     if not config.model.doppler_bins and grid.num_elevation:

@@ -129,8 +129,6 @@ def test_boxes_are_found_in_files_and_arrays(
     for frames in (arrays, [arrays[0], *paths[1:]]):
         np.testing.assert_array_equal(np.asarray(detector(frames).boxes), expected)
     np.testing.assert_array_equal(detector(arrays[0]).boxes, expected[:1])
-    if release == "polar3d":
-        np.testing.assert_array_equal(detector(np.stack(arrays)).boxes, expected)
     with pytest.raises(DataError, match=r"^frame: "):
         detector([arrays[0] * 1e13])
 

@@ -213,7 +213,7 @@ BAD = {
     "half": (lambda: _polar().astype(np.float16), "of float16, expected float64"),
     "no points": (lambda: _points()[:0], "shape (0, 11)"),
     "seven columns": (lambda: _points(7), "shape (70, 7)"),
-    "Cartesian": (lambda: _points(4), "points [N, 4] of a Cartesian grid (sprdr) cannot"),
+    "Cartesian": (lambda: _points(4), "points [N, 4] on a Cartesian grid have neither Doppler"),
     "raw power": (lambda: _polar() * [[[[1e13]]], [[[1]]]], _SCALE),
     "decibels": (lambda: np.abs(10 * np.log10(1e13 * _polar()[[0, 0]])), _SCALE),
     "decibels of divided power": (lambda: 10 * np.log10(_polar()[[0, 0]]), _SCALE),

@@ -238,5 +238,11 @@ def test_a_sensor_without_elevation_is_a_kradar_tree_without_its_channels(tmp_pa
     by_power, by_projection = detector(power), detector(projection)
     np.testing.assert_allclose(by_power.scores, by_projection.scores, atol=1e-3)
     assert by_power.is_valid.any()
+    config.data.num_frames = 2
+    stacked = np.tile(projection, 2)[None]
+    variables = small.drawn(models.build(config.model, 2), stacked)
+    several = Detector(SavedModel(config, grid, variables), score_threshold=0.0)
+    by_powers, by_projections = several([power] * 2), several([projection] * 2)
+    np.testing.assert_allclose(by_powers.scores, by_projections.scores, atol=1e-3)
     again = detector(str(frames[0].radar_path))
     np.testing.assert_array_equal(again.boxes, by_projection.boxes)
