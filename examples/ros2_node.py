@@ -13,12 +13,13 @@ from radejax.data.points import Points, cfar_points
 from radejax.data.projection import project_tensor
 
 
-def box_fields(detections):
-    """Yields position (z from the LiDAR), quaternion, size, class and score of every box."""
+def box_fields(detections, shift_z_m):
+    """Yields position (z raised by `shift_z_m`), quaternion, size, class, score of every box."""
     for box in detections.to_list()[0]:
         half_yaw = box["yaw"] / 2
         quaternion = (0.0, 0.0, float(np.sin(half_yaw)), float(np.cos(half_yaw)))
         position, size = ([box[k] for k in names] for names in ("xyz", "lwh"))
+        position[2] += shift_z_m
         yield position, quaternion, size, box["cls"], box["score"]
 
 
@@ -31,7 +32,10 @@ def point_bytes(points: Points) -> tuple[list[str], bytes]:
 @click.command()
 @click.argument("workdir", type=click.Path(exists=True))
 @click.option("--frame-id", default="radar", help="Frame of the boxes and points.")
-def main(workdir, frame_id):
+@click.option(
+    "--box-z", default=0.7, help="z of the boxes' origin, the LiDAR; K-Radar: 0.7 m."
+)
+def main(workdir, frame_id, box_z):
     """Publish the detections of the run WORKDIR."""
     import rclpy
     from sensor_msgs.msg import PointCloud2, PointField
@@ -49,13 +53,12 @@ def main(workdir, frame_id):
         projection, result = project_tensor(tensor), Detection3DArray()
         result.header.frame_id, now = frame_id, node.get_clock().now()
         result.header.stamp = now.to_msg()
-        for position, quaternion, size, cls, score in box_fields(detector(projection)):
+        for position, quaternion, size, cls, score in box_fields(
+            detector(projection), box_z
+        ):
             found, kind = Detection3D(header=result.header), ObjectHypothesisWithPose()
-            center, shape, q = (
-                found.bbox.center,
-                found.bbox.size,
-                found.bbox.center.orientation,
-            )
+            center, shape = found.bbox.center, found.bbox.size
+            q = center.orientation
             kind.hypothesis.class_id, kind.hypothesis.score = cls, score
             center.position.x, center.position.y, center.position.z = position
             q.x, q.y, q.z, q.w = quaternion

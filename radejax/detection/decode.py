@@ -16,7 +16,7 @@ import numpy as np
 from flax import struct
 from jaxtyping import Bool, Float, Num, Real
 
-from radejax.core.errors import check_options, integer, number, one_of
+from radejax.core.errors import check_options, integer, number, one_of, or_none
 from radejax.core.structures import MIN_SIZE_M, Array, DetectionMaps, Detections
 from radejax.detection.nms import rotated_nms
 from radejax.geometry.boxes import boxes7_from_8
@@ -50,14 +50,26 @@ class DecodeOptions:
             "max_detections": integer(1),
             "score_threshold": number(0, 1),
             "nms_iou": number(0, 1),
-            "roi": (_is_roi, "six numbers x0, x1, y0, y1, z0, z1, or None"),
+            "roi": or_none(
+                (lambda roi: is_roi(roi) and bool(np.isfinite(roi).all()), ROI_LIMITS)
+            ),
             "raw_yaw": one_of(*get_args(RawYaw)),
         }
         check_options(vars(self), "config.decode", ranges)
 
 
-def _is_roi(roi: Any) -> bool:
-    return roi is None or (len(roi) == 6 and bool(np.isfinite(roi).all()))
+ROI_LIMITS = "six numbers x0 < x1, y0 < y1, z0 < z1"
+
+
+def is_roi(roi: Any) -> bool:
+    """Returns whether values are the `ROI_LIMITS` of a region, which may be infinite.
+
+    Examples:
+        >>> is_roi([0, 72, -6.4, 6.4, -2, 6]), is_roi([0, 72, None, None, -2, 6])
+        (True, False)
+    """
+    limits = np.array(roi, float)  # None becomes NaN
+    return limits.shape == (6,) and bool((limits[::2] < limits[1::2]).all())
 
 
 class Peaks(struct.PyTreeNode):

@@ -35,7 +35,7 @@ from radejax.data.projection import (
 )
 from radejax.data.reduced import is_reduced, project_reduced
 from radejax.data.tesseract import read_frame
-from radejax.detection.decode import DecodeOptions, decode
+from radejax.detection.decode import ROI_LIMITS, DecodeOptions, decode, is_roi
 from radejax.geometry.camera import (
     KRADAR_RADAR_FROM_LIDAR_Z_M,
     RADAR_FROM_LIDAR_M,
@@ -716,6 +716,6 @@ def _settings(
         require(0 <= value <= 1, name, value, "a number from 0 to 1")
     if roi is not None:
         limits = ROIS.get(roi, ()) if isinstance(roi, str) else tuple(roi)
-        require(len(limits) == 6, "roi", roi, "narrow, wide or x0, x1, y0, y1, z0, z1")
+        require(is_roi(limits), "roi", roi, f"narrow, wide or {ROI_LIMITS}")
         settings["roi"] = limits
     return settings

@@ -53,6 +53,8 @@ def load(folder: str | pathlib.Path = FOLDER, device: jax.Device | None = None):
         if unknown := set(settings) - set(defaults):
             raise TypeError(f"unknown {unknown}, expected {sorted(defaults)}")
         values = [np.asarray(x, np.float32) for x in {**defaults, **settings}.values()]
+        if not (values[2][::2] < values[2][1::2]).all():  # also if a limit is NaN
+            raise ValueError(f"roi {values[2]}: expected x0 < x1, y0 < y1, z0 < z1")
         # On CPU, device_put shares memory with arrays that the caller may overwrite, so
         # they are copied.
         own = jax.tree.map(np.array, inputs)
@@ -64,6 +66,8 @@ def load(folder: str | pathlib.Path = FOLDER, device: jax.Device | None = None):
 if __name__ == "__main__":
     detect = load()
     for path in sys.argv[1:]:
-        found = jax.device_get(detect(np.load(path).astype(np.float32)[None]))
+        array = np.load(path)
+        levels = np.float32(1 / 255 if array.dtype == np.uint8 else 1)  # of records
+        found = jax.device_get(detect(array.astype(np.float32)[None] * levels))
         rows = found["is_valid"][0]
         print(path, found["scores"][0][rows], found["boxes"][0][rows], sep="\n")

@@ -140,7 +140,8 @@ def test_the_ablation_tables_of_the_configs_are_the_published_ones(name):
     assert {(name, v): [d3, bev] for v, d3, bev in table} == {
         key: aps for key, aps in published.items() if key[0] == name
     }
-    assert set(module.VARIANTS) == {variant for variant, *_ in table}
+    unpublished = {"rcw_dinov2"} if name == "dinorade" else set()
+    assert set(module.VARIANTS) - unpublished == {variant for variant, *_ in table}
 
 
 def test_some_numbers_as_printed():

@@ -12,11 +12,12 @@ from .. import small_models as small
 def test_boxes_have_the_yaw_as_a_quaternion():
     detector, projection = small.detector(), small.projections(1)
     detections = detector(projection)
-    rows = list(ros2_node.box_fields(detections))
+    rows = list(ros2_node.box_fields(detections, 0.7))
     assert len(rows) == int(detections.is_valid.sum()) > 0
     for row, (position, quaternion, size, cls, score) in enumerate(rows):
         box = np.asarray(detections.boxes[0, row])
-        np.testing.assert_allclose([*position, *size], box[:6])
+        raised = [*position[:2], position[2] - 0.7]
+        np.testing.assert_allclose([*raised, *size], box[:6], rtol=1e-6, atol=1e-6)
         x, y, z, w = quaternion
         assert (x, y) == (0.0, 0.0)
         assert z * z + w * w == pytest.approx(1.0)

@@ -285,8 +285,19 @@ def test_arguments_by_name_and_wrong_ones():
     detector = small.detector(roi="narrow")
     assert tuple(detector.decode_options["roi"]) == tuple(NARROW_ROI)
     for wrong, message in (
-        ({"roi": "middle"}, "roi is 'middle', expected narrow, wide or x0"),
+        (
+            {"roi": "middle"},
+            "roi is 'middle', expected narrow, wide or six numbers x0 < x1",
+        ),
         ({"roi": (0, 1)}, r"roi is \(0, 1\), expected narrow"),
+        (
+            {"roi": (0, 72, None, None, -2, 6)},
+            r"roi is \(0, 72, None, None, -2, 6\), exp",
+        ),
+        (
+            {"roi": (72, 0, -6, 6, -2, 6)},
+            r"roi is \(72, 0, -6, 6, -2, 6\), expected narrow",
+        ),
         ({"batch_sizes": (0,)}, r"batch_sizes is \(0,\), expected integers of"),
         ({"batch_sizes": ()}, r"batch_sizes is \(\), expected"),
         ({"nms_iou": 1.5}, r"nms_iou is 1.5, expected a number"),

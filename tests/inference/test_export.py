@@ -16,6 +16,7 @@ from jaxlib import _jax as jaxlib_client
 
 from radejax import Detector, UserError
 from radejax.core.structures import MIN_SIZE_M
+from radejax.data.projection import encode
 from radejax.geometry.camera import stack_cameras
 from radejax.inference import export, exported_loader
 
@@ -120,6 +121,10 @@ def test_a_fresh_process_without_radejax_finds_the_same_boxes(tmp_path):
     _check(found, "strict", strict)
     config = json.loads((folder / "config.json").read_text())
     assert config["config"]["decode"]["score_threshold"] == 0.1
+    np.save(tmp_path / "uint8.npy", encode(projection[0], "uint8"))
+    command = [sys.executable, folder / "load.py", tmp_path / "uint8.npy"]
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert printed.count("\n") > 3  # a record of uint8 has objects as well
     again = Detector.from_workdir(folder, batch_sizes=(4,))
     _check(found, "3", again(projection))
 
@@ -205,6 +210,9 @@ def test_a_program_that_begins_with_the_tensor(tmp_path):
         TypeError, match=r"unknown {'iou'}, expected \['nms_iou', 'roi'"
     ):
         exported_loader.load(tmp_path)(small.projections(1), iou=0.5)
+    for region in ((0, 20, None, None, -9, 9), (20, 0, -5, 5, -9, 9)):
+        with pytest.raises(ValueError, match=r"roi .* expected x0 < x1"):
+            exported_loader.load(tmp_path)(small.projections(1), roi=region)
     export.export(detector, tmp_path, kind="huggingface")
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"README.md", "config.json", "model.safetensors"}

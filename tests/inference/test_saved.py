@@ -117,7 +117,7 @@ def test_weights_of_another_run_need_the_same_model(tmp_path):
 def test_without_anything_to_start_from_all_is_initialized():
     config = small.radar_config().model
     assert starting_weights(config) == saved.StartingWeights()
-    with pytest.raises(UserError, match="which has no camera"):
+    with pytest.raises(UserError, match="RadeNet has no camera"):
         starting_weights(config, image_backbone_path="dinov3")
 
 
