@@ -77,7 +77,7 @@ def _radar(**fields: Any) -> Cell:
 
 
 def _row(name: str) -> Cell:
-    """Returns the variant of a row of Table III; "expand" doubles the width of this decoder."""
+    """Returns the variant of one row of Table III; "expand" doubles the width of this decoder."""
     fields = {f"model.{k}": v for k, v in _VARIANTS[name].items()}
     return Cell(
         _RADAR, fields | ({"model.decoder_width": 64} if name == "expand" else {})

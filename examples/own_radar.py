@@ -4,7 +4,7 @@
 
 The radar has no elevation, and its beams are uniform in sin(azimuth). The folder has the files
 `radar/DRIVE_FRAME.npy`, linear power `[range, azimuth, Doppler]`, and `boxes.csv` with boxes in a
-vehicle frame; if it is missing, the command simulates such a recording. It draws a frame, trains
+vehicle frame; if it is missing, the command simulates such a recording. It draws one frame, trains
 and evaluates in about three minutes on two cores. `docs/extending.md` explains this file.
 """
 

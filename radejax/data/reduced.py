@@ -63,7 +63,7 @@ def is_reduced_file(path: PathLike) -> bool:
 
 
 def is_reduced(frame: Real[np.ndarray, "..."], grid: RadarGrid) -> bool:
-    """Returns True if an array is a frame of a reduced release by its shape.
+    """Returns True if an array belongs to a reduced release by its shape.
 
     Without a Doppler axis, a `polar3d` frame has the shape of two projections. It is then
     recognized by the negative values of its Doppler.
@@ -83,7 +83,7 @@ def polar_shape(grid: RadarGrid) -> tuple[int, int, int, int]:
 def project_reduced(
     frame: Real[np.ndarray, "..."], grid: RadarGrid, name: str = "frame"
 ) -> Float[np.ndarray, "R A DE"]:
-    """Computes the float32 projection of a frame of a reduced release.
+    """Computes the float32 projection of one frame of a reduced release.
 
     Points `[N, 5]` at range 0 are left out, because their direction is not known.
 

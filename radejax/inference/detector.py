@@ -358,7 +358,7 @@ class Detector:
 
         Args:
             frames: Single frames as arrays or paths.
-            history: The last T - 1 projections, or None at the start of a sequence.
+            history: The last T - 1 projections, or None before the first frame.
         """
         new, past = _projections(self._read(frames, 1), self.grid), self.num_frames - 1
         if history is None:
@@ -488,7 +488,7 @@ def radar_batch(
 
     Raises:
         UserError: The shape is that of no radar data, or there is no frame.
-        DataError: A file is corrupted, or a frame of a reduced release is not as in the
+        DataError: A file is corrupted, or one frame of a reduced release is not as in the
             release.
     """
     radar = _read_paths(frames, lambda path, _: read_frame(path, grid))
