@@ -63,20 +63,19 @@ class OwnFrame(LabelledFrame):
 class OwnRadar(LabelledFrames):
     """The frames of a folder; every fifth drive is in the test split."""
 
-    def __init__(self, roots, labels=None, *, classes, **not_used):
+    def __init__(self, roots, labels=None, **not_used):
         root, frames = pathlib.Path(roots[0]), []
         boxes_of = read_boxes(root / "boxes.csv")
         for path in sorted((root / "radar").glob("*.npy")):
             names, boxes = boxes_of.pop(path.stem, (np.zeros(0), np.zeros((0, 7))))
-            kept = np.isin(names, classes)
             drive, _, number = path.stem.partition("_")
             frames.append(
                 OwnFrame(
                     radar_path=path,
                     sequence=int(drive),
                     name=number,
-                    boxes=to_radar_frame(boxes[kept]),
-                    classes=names[kept],
+                    boxes=to_radar_frame(boxes),
+                    classes=names,
                 )
             )
         super().__init__(frames, GRID)

@@ -165,6 +165,7 @@ def test_records_of_other_files_or_of_another_reader_are_reported(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     root, reader = _write_toy(tmp_path), data_set("toy:Toy")
+    toy = sys.modules["toy"]
 
     def again() -> str:
         caplog.clear()
@@ -178,6 +179,12 @@ def test_records_of_other_files_or_of_another_reader_are_reported(
     assert "changed" not in text
     (root / "1" / "0002.npz").touch()
     assert "radar files of 1 of them, such as that of frame 1/0002, have" in again()
+    read = toy.ToyFrame.read_projection
+    mirrored = lambda frame, grid: read(frame, grid)[:, ::-1]  # noqa: E731
+    with monkeypatch.context() as patch:
+        patch.setattr(toy.ToyFrame, "read_projection", mirrored)
+        with pytest.raises(UserError, match=r"1/0001 is not what the reader computes"):
+            again()
     monkeypatch.setattr(reader, "reader_version", "2")
     with pytest.raises(
         UserError, match=r"other records: source.reader is \['toy:Toy', ''"
@@ -326,7 +333,7 @@ def test_own_parts_are_imported_wherever_a_run_is_opened(
     out = tmp_path / "exported"
     _forget()
     export(Detector.from_workdir(folder), out, platforms=("cpu",))
-    assert "parts:PowerNet" in (out / "README.md").read_text()
+    assert "PowerNet" in (out / "README.md").read_text()
     _forget()
     projection = np.full((1, *detector.grid.projection_shape), 0.5, np.float32)
     again = Detector.from_workdir(out)

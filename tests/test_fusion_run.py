@@ -18,7 +18,7 @@ from radejax.core.config import load_config, load_module
 from radejax.core.errors import DataError, UserError
 from radejax.data.pipeline import require_images
 from radejax.data.records import open_embeddings
-from radejax.inference.detect_files import detect_files, output_name
+from radejax.inference.detect_files import detect_files, key_of
 from radejax.inference.detector import Detector
 from radejax.inference.predict import embed_dataset, predict_dataset
 from radejax.inference.saved import load_model
@@ -334,7 +334,7 @@ def test_detect_finds_the_images_by_the_labels(from_images, tmp_path):
     expected = detector(
         path, [frame.camera_path], [frame.camera_calibration_path]
     ).to_list()[0]
-    name = f"{output_name(path)}.json"
+    name = f"{key_of(path).replace('/', '_')}.json"
     assert [box["x"] for box in seen[name]] == pytest.approx(
         [box["x"] for box in expected], abs=1e-3
     )

@@ -221,23 +221,29 @@ class LabelledFrames(Sequence[_F]):
         }
         return self.without(left_out, "other sequences or weather")
 
-    def with_valid_boxes(self) -> Self:
+    def with_valid_boxes(self, classes: Collection[str]) -> Self:
         """Returns the dataset without objects that no detector can learn.
 
-        These are boxes with values that are not finite or sizes that are not above 0, and
-        those whose center is outside the field of view. The summary counts them.
+        These are objects of other classes than `classes`, boxes with values that are not
+        finite or sizes that are not above 0, and those whose center is outside the field of
+        view. The summary counts them.
 
         Raises:
             UserError: Yaws are in degrees.
         """
         other = copy.copy(self)
         other._summary = copy.deepcopy(self._summary)
-        other._frames = [self._valid(frame, other._summary.counts) for frame in self]
+        counts = other._summary.counts
+        other._frames = [self._valid(frame, classes, counts) for frame in self]
         return other
 
-    def _valid(self, frame: _F, counts: collections.Counter[str]) -> _F:
+    def _valid(
+        self, frame: _F, classes: Collection[str], counts: collections.Counter[str]
+    ) -> _F:
         boxes = np.asarray(frame.boxes, np.float64).reshape(-1, 7)
-        reasons = {
+        names = np.asarray(frame.classes)
+        others = set(names.tolist()).difference(classes)
+        reasons = {f"class {name!r}": names == name for name in sorted(others)} | {
             "a value is not finite": ~np.isfinite(boxes).all(axis=1),
             "a size is not above 0": ~(boxes[:, 3:6] > 0).all(axis=1),
             "field of view": ~self.grid.in_field_of_view(*boxes[:, :2].T),
@@ -253,8 +259,7 @@ class LabelledFrames(Sequence[_F]):
             )
         if kept.all():
             return frame
-        classes = np.asarray(frame.classes)[kept]
-        return dataclasses.replace(frame, boxes=boxes[kept], classes=classes)
+        return dataclasses.replace(frame, boxes=boxes[kept], classes=names[kept])
 
 
 def data_set(name: str) -> Callable[..., LabelledFrames]:

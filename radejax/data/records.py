@@ -31,7 +31,7 @@ from radejax.core.archives import wrap_read_errors
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.workers import process_pool
 from radejax.data.dataset import FrameSequence, LabelledFrame, LabelledFrames
-from radejax.data.projection import ENCODINGS, encode
+from radejax.data.projection import ENCODINGS, decode, encode
 from radejax.geometry.radar_grid import RadarGrid, is_uniform
 
 _log = logging.getLogger(__name__)
@@ -345,13 +345,8 @@ def preprocess(
         is_small = len(missing) * math.prod(grid.shape_drea) < _SMALL_JOB_BINS
         num_workers = 0 if is_small else os.cpu_count() or 1
     with contextlib.closing(_write_all(records, missing, num_workers)) as results:
-        bar = tqdm(
-            results,
-            "preprocess",
-            len(missing),
-            unit="frame",
-            disable=not (progress and missing),
-        )
+        is_hidden = not (progress and missing)
+        bar = tqdm(results, "preprocess", len(missing), unit="frame", disable=is_hidden)
         skipped = dict(sorted((key, reason) for key, reason in bar if reason))
     num_found = len(mine) - len(missing)
     return PreprocessReport(len(mine), num_found, skipped, time.perf_counter() - began)
@@ -366,7 +361,11 @@ def _file_of(frame: LabelledFrame) -> list[Any] | None:
 
 
 def _warn_of_changes(records: Records, frames: FrameSequence) -> None:
-    """Logs which records are used and which of their radar files have changed since."""
+    """Logs which records are used and which of their radar files have changed since.
+
+    Raises:
+        UserError: The reader computes another projection for a file that has not changed.
+    """
 
     def is_changed(frame: LabelledFrame) -> bool:
         file, stored = _file_of(frame), records.path(frame.key).with_suffix(".json")
@@ -380,6 +379,13 @@ def _warn_of_changes(records: Records, frames: FrameSequence) -> None:
             "the folder to preprocess them again",
             *(len(changed), changed[0]),
         )
+    for frame in itertools.islice((f for f in frames if f.key not in changed), 1):
+        now = encode(frame.read_projection(records.grid), records.dtype)
+        if not np.allclose(decode(now), decode(records[frame.key]), atol=0.01):
+            raise UserError(
+                f"{records.folder}: the record of frame {frame.key} is not what the reader "
+                "computes now: delete the folder to preprocess again"
+            )
 
 
 def _write_all(

@@ -147,8 +147,9 @@ class RadarGrid(ArrayValues):
                     f"{name} must be a vector of at least {least} bins, got shape "
                     f"{axis.shape}"
                 )
-            if not (np.abs(axis) <= _MAX_VALUE).all():
-                raise ValueError(f"{name} must be finite, got {axis}")
+            limit = np.pi if name.endswith("_rad") else _MAX_VALUE
+            if not (np.abs(axis) <= limit).all():
+                raise ValueError(f"{name} must be finite, to {limit:g}, got {axis}")
             steps, kind = np.diff(axis), "increasing"
             if name != "range_m":
                 steps *= np.sign(axis[-1:] - axis[:1])
@@ -160,9 +161,9 @@ class RadarGrid(ArrayValues):
                 "elevation_rad and doppler_mps are both empty, expected at least one bin"
             )
         for name in ("fov_range_m", "fov_azimuth_rad"):
-            value = getattr(self, name)
-            if not 0 < value <= _MAX_VALUE:
-                raise ValueError(f"{name} must be positive and finite, got {value}")
+            value, limit = getattr(self, name), np.pi if "rad" in name else _MAX_VALUE
+            if not 0 < value <= limit:
+                raise ValueError(f"{name} must be positive, to {limit:g}, got {value}")
 
     # Construction --------------------------------------------------------------------
 

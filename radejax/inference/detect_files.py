@@ -286,10 +286,10 @@ def _files(
     frames = find_frames(paths, sequence_numbers, weather)
     seen: dict[str, pathlib.Path] = {}
     for path in frames:
-        if (other := seen.setdefault(output_name(path), path)) is not path:
+        if (other := seen.setdefault(key_of(path), path)) is not path:
             raise UserError(
-                f"{other} and {path} would both be written as "
-                f"{output_name(path)}.json: detect each root into a folder of its own"
+                f"{other} and {path} would both be written as frame "
+                f"{key_of(path)}: detect each root into a folder of its own"
             )
     if detector.num_frames > 1:  # folders of tensors and of projections may be mixed
         frames.sort(key=key_of)
@@ -381,8 +381,3 @@ def key_of(path: pathlib.Path) -> str:
         radar = radar.removeprefix(pattern.partition("*")[0])
     sequence = _sequence(path).name
     return frame_key(f"{sequence}/{radar}" if sequence else radar)
-
-
-def output_name(path: pathlib.Path) -> str:
-    """Return a name such as "5_00033", which is unique among the sequences of a dataset."""
-    return key_of(path).replace("/", "_")

@@ -7,6 +7,7 @@ The programs run without radejax. Folders of all formats contain `config.json` a
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import json
 import logging
 import pathlib
@@ -131,30 +132,24 @@ def export(
     for name in set(_OF_PROGRAMS) - kept:
         (folder / name).unlink(missing_ok=True)
     if kind == "stablehlo":
-        loader = pathlib.Path(exported_loader.__file__)
-        files.write_text(folder / "load.py", loader.read_text())
-    card = _readme(detector, shape, content["left_out"])
-    files.write_text(folder / "README.md", card)
+        files.write_text(folder / "load.py", inspect.getsource(exported_loader))
+    left_out = content["left_out"]
+    files.write_text(folder / "README.md", _readme(detector, shape, left_out))
     return {
         "bytes": sum(p.stat().st_size for p in folder.rglob("*") if p.is_file()),
-        "left_out": content["left_out"],
+        "left_out": left_out,
     }
-
-
-_NAMES = {"radenet": "RADE-Net", "dinorade": "DinoRADE"}
 
 
 def _readme(detector: Detector, shape: Sequence[int], left_out: Sequence[str]) -> str:
     """Return the text of the model card."""
-    radar = f"Projections [B, {', '.join(map(str, shape))}] float32"
-    if len(shape) == 4:
-        radar = f"Power [B, {', '.join(map(str, shape))}] float32 of radar tensors"
+    radar = "Power of radar tensors" if len(shape) == 4 else "Projections"
     config = detector.saved.config
     is_simulated = (config.get("simulation") or {}).get("scenes") == "procedural"
     return _MODEL_CARD.read_text().format(
-        name=_NAMES.get(config.model.name, config.model.name),
+        name=type(detector.model).__name__,
         classes=", ".join(detector.classes),
-        input=f"{radar}, B frames.",
+        input=f"{radar} [B, {', '.join(map(str, shape))}] float32, B frames.",
         radejax=radejax.__version__,
         jax=jax.__version__,
         count=config.decode.max_detections,

@@ -98,7 +98,7 @@ class Data:
         if self.frames.release is not None and not config.model.doppler_bins:
             self.frames.grid = self.frames.grid.without_doppler()
         if options.format != "kradar":  # the reader of K-Radar checks its labels itself
-            self.frames = self.frames.with_valid_boxes()
+            self.frames = self.frames.with_valid_boxes(self.classes)
 
     def preprocess(self) -> None:
         """Write the missing records on the main process while the others wait.

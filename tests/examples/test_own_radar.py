@@ -41,7 +41,8 @@ def test_boxes_are_in_the_radar_frame_and_power_in_decibels(
 ) -> None:
     lines = [f"0004_0001,car,{BOX}", f"0004_0001,pedestrian,{BOX}", f"9_1,car,{BOX}"]
     root = write(tmp_path, lines, power)
-    frames = OwnRadar([root], classes=("car", "truck"))
+    frames = OwnRadar([root]).with_valid_boxes(own_radar.CLASSES)
+    assert frames.summary().counts["objects left out: class 'pedestrian'"] == 1
     assert frames[0].classes.tolist() == ["car"]
     np.testing.assert_allclose(
         frames[0].boxes, [[10, 2, 0.3, 4, 1.8, 1.6, 0]], atol=1e-9
@@ -101,9 +102,9 @@ def test_a_simulated_recording_is_trained_evaluated_and_drawn(
     metrics = json.loads((run / "evaluation" / "metrics.json").read_text())
     assert metrics["options"]["classes"] == ["car", "truck"]
     # In every drive with a car, it is where the power is.
-    frames = OwnRadar([root], classes=("car",))
+    frames = OwnRadar([root])
     gains = []
-    for frame in frames.with_valid_boxes():
+    for frame in frames.with_valid_boxes(("car",)):
         level = frame.read_projection(GRID).max(-1)
         r, a = GRID.nearest_bin(frame.boxes[:, 0], frame.boxes[:, 1]).T
         near = [

@@ -162,7 +162,15 @@ def test_reduced_grid_looks_like_the_sensor():
         ({"doppler_mps": np.array([0.0, np.nan])}, "doppler_mps must be finite"),
         ({"azimuth_rad": np.array([0.0, np.inf])}, "azimuth_rad must be finite"),
         ({"elevation_rad": np.array([0, 1e300])}, "elevation_rad must be finite"),
-        ({"fov_range_m": np.nan}, "fov_range_m must be positive and finite"),
+        ({"fov_range_m": np.nan}, "fov_range_m must be positive, to 10000, got nan"),
+        (
+            {"azimuth_rad": np.linspace(-53, 53, 107)},
+            "azimuth_rad must be finite, to 3.14159, got",
+        ),
+        (
+            {"fov_azimuth_rad": 53.0},
+            "fov_azimuth_rad must be positive, to 3.14159, got",
+        ),
     ],
 )
 def test_bad_axes_are_rejected(changes, message):

@@ -17,7 +17,7 @@ from radejax.inference.detect_files import (
     detect_files,
     find_frames,
     front_images,
-    output_name,
+    key_of,
 )
 from radejax.inference.saved import load_model, save_model
 from radejax.simulation.dataset import default_config, simulate_dataset
@@ -53,14 +53,14 @@ def test_every_frame_is_found_once_and_its_projection_preferred(root, monkeypatc
 
 
 def test_names_of_results_are_unique_among_sequences(root):
-    names = {output_name(path) for path in find_frames([root])}
+    names = {key_of(path).replace("/", "_") for path in find_frames([root])}
     assert names == {"5_00033", "5_00034", "6_00033"}
 
 
 def test_a_part_of_the_frames(root):
     for sequence, weather in (("5", "fog"), ("6", "rain")):
         (root / sequence / "description.txt").write_text(f"urban,day,{weather}\n")
-    assert [output_name(p) for p in find_frames([root], (6, 9))] == ["6_00033"]
+    assert [key_of(p) for p in find_frames([root], (6, 9))] == ["6/00033"]
     assert len(find_frames([root], weather=("fog",))) == 2
     with pytest.raises(UserError, match=r"no frames for .*, 5, rain: looked for"):
         find_frames([root], (5,), ("rain",))
@@ -158,7 +158,7 @@ def test_two_frames_of_one_name_are_rejected(tmp_path):
         path.parent.mkdir(parents=True)
         path.touch()
     save_model(small.saved(), tmp_path / "model")
-    with pytest.raises(UserError, match=r"a/5/.* and .*b/5/.* 5_00033.json"):
+    with pytest.raises(UserError, match=r"a/5/.* and .*b/5/.* frame 5/00033"):
         detect_files(
             tmp_path / "model", [tmp_path / "a", tmp_path / "b"], tmp_path / "out"
         )

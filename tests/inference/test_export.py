@@ -199,7 +199,10 @@ def test_a_program_that_begins_with_the_tensor(tmp_path):
     rows = json.loads((tmp_path / "inputs.json").read_text())
     assert rows[-4]["name"] == "tensor"
     assert rows[-4]["unit"] == "linear power"
-    assert "Power [B, 2, 16, 3, 14] float32" in (tmp_path / "README.md").read_text()
+    assert (
+        "Power of radar tensors [B, 2, 16, 3, 14] float32"
+        in (tmp_path / "README.md").read_text()
+    )
     # Another export into the same folder removes what it does not write.
     export.export(detector, tmp_path, platforms=("cpu",))
     assert not (tmp_path / "detector.mlirbc").exists()
