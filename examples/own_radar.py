@@ -65,7 +65,8 @@ class OwnRadar(LabelledFrames):
 
     def __init__(self, roots, labels=None, **not_used):
         root, frames = pathlib.Path(roots[0]), []
-        boxes_of = read_boxes(root / "boxes.csv")
+        labels_file = root / "boxes.csv"
+        boxes_of = read_boxes(labels_file) if labels_file.exists() else {}
         for path in sorted((root / "radar").glob("*.npy")):
             names, boxes = boxes_of.pop(path.stem, (np.zeros(0), np.zeros((0, 7))))
             drive, _, number = path.stem.partition("_")
