@@ -108,7 +108,7 @@ class ViT(nn.Module):
         chex.assert_shape(image, (None, None, None, 3))
         rows, columns = self.grid(*image.shape[1:3])
         size = (rows * self.patch_size, columns * self.patch_size)
-        image = jax.image.resize(image, (len(image), *size, 3), "linear")
+        image = jax.image.resize(image, (image.shape[0], *size, 3), "linear")
         tokens = self._embed(image, rows, columns)
         head_dim = self.hidden_size // self.num_heads
         rope = None if self.position_grid else rotary_angles(rows, columns, head_dim)
