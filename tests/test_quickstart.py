@@ -140,8 +140,12 @@ def test_evaluate_takes_other_data(undisturbed: tuple, tmp_path: pathlib.Path) -
     assert source["roots"] == [str(tmp_path / "other")]
     assert source["split"] == "test"
     done = evaluate("--split=train", f"--data={tmp_path / 'other'}")
-    assert done.exit_code == 2
-    assert "split is 'test' there and 'train' here; give --out" in done.stderr
+    assert done.exit_code == 0, done.output
+    source = json.loads(
+        (folder / "run" / "evaluation_other_train" / "source.json").read_text()
+    )
+    assert source["split"] == "train"
+    assert json.loads(found.with_name("source.json").read_text())["split"] == "test"
 
 
 def test_a_checkpoint_folder_loads_as_the_model_of_its_run(undisturbed: tuple) -> None:
