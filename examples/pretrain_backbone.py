@@ -30,7 +30,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from ml_collections import ConfigDict
-from PIL import Image, ImageDraw
 
 from radejax import models
 from radejax.cli import entry
@@ -44,7 +43,7 @@ from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibratio
 from radejax.simulation.camera.shapes import camera_position
 from radejax.simulation.config import SimulationConfig, plain
 from radejax.simulation.simulator import make_source
-from radejax.simulation.world.scene import SceneFrame, Sequence
+from radejax.simulation.world.scene import Sequence
 from radejax.simulation.world.traffic import SIZES
 from radejax.weights import dinov3_hf, image_backbone
 
@@ -94,21 +93,6 @@ def with_small_ones(sequence: Sequence, share: float, seed: int) -> Sequence:
     return dataclasses.replace(sequence, tracks=tracks)
 
 
-def shown_boxes(
-    renderer: CameraRenderer, frame: SceneFrame, side: int = 0
-) -> np.ndarray:
-    """Returns the index of the box that each pixel `[H, W]` shows, -1 for none.
-
-    Air and lens are assumed to be clear. Roadside shapes cover the objects behind them.
-    """
-    calibration = renderer.calibrations[side]
-    canvas = Image.new("I", (calibration.width, calibration.height), -1)
-    draw = ImageDraw.Draw(canvas)
-    for polygon in renderer.polygons(frame, side):
-        draw.polygon(polygon.points, fill=polygon.box)
-    return np.asarray(canvas)
-
-
 def draw(
     simulation: dict[str, Any], patch: int, count: int, seed: int, share: float = 0.0
 ) -> Images:
@@ -149,7 +133,7 @@ def draw(
             mode=config.camera_mode,
         )
         frame = sequence.frame(0)
-        box = shown_boxes(renderer, frame)
+        box = renderer.shown_boxes(frame, 0)
         cls = np.append(frame.cls, -1)[box]  # -1 where there is no box
         near = NEAR_M / np.linalg.norm(frame.boxes[:, :3] - origin, axis=1)
         near = np.append(near, 0.0)[box][..., None]

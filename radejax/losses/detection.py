@@ -176,7 +176,8 @@ def detection_loss(
         jnp.where(row, expected, 1.0),
         is_matched,
     )
-    terms = {name: chosen.terms[name](pairs, chosen) for name in chosen.weights}
+    functions = chosen.terms
+    terms = {name: functions[name](pairs, chosen) for name in chosen.weights}
     total = _weighted_sum(terms, chosen.weights, chosen.normalize)
     terms["weighted_sum"] = _weighted_sum(terms, chosen.weights, False)
     counted = {"objects": is_valid, "positive": target >= 1, "matched": is_matched}

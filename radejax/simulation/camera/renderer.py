@@ -11,7 +11,7 @@ import dataclasses
 import functools
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int32, UInt8
 from PIL import Image, ImageDraw
 
 from radejax.core.structures import CLASSES
@@ -205,6 +205,18 @@ class CameraRenderer:
                 share = _HALF_BRIGHT_M / (_HALF_BRIGHT_M + polygon.depth_m)
                 color = _CLASS_COLORS[frame.cls[polygon.box]] * share
                 draw.polygon(polygon.points, fill=tuple(color.astype(int).tolist()))
+        return np.asarray(canvas)
+
+    def shown_boxes(self, frame: SceneFrame, side: int) -> Int32[np.ndarray, "H W"]:
+        """Returns the index of the box that each pixel shows, -1 for none.
+
+        Air and lens are assumed to be clear. Roadside shapes cover the objects behind them.
+        """
+        calibration = self.calibrations[side]
+        canvas = Image.new("I", (calibration.width, calibration.height), -1)
+        draw = ImageDraw.Draw(canvas)
+        for polygon in self.polygons(frame, side):
+            draw.polygon(polygon.points, fill=polygon.box)
         return np.asarray(canvas)
 
     def polygons(self, frame: SceneFrame, side: int) -> list[shapes.Polygon]:

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from PIL import Image, ImageDraw
 
 from radejax.core.structures import CLASSES
 from radejax.data.kradar import read_labels
@@ -50,17 +49,7 @@ def shown_boxes(boxes, classes, side=0):
     """Which box every pixel of one camera shows."""
     sequence = make_scene(boxes, classes)
     renderer = camera.CameraRenderer(sequence, PAIR, 0)
-    return box_of_pixels(renderer, sequence.frame(0), side)
-
-
-def box_of_pixels(renderer, frame, side=0):
-    """The index of the box that each pixel shows, -1 for none, painted from far to near."""
-    calibration = renderer.calibrations[side]
-    canvas = Image.new("I", (calibration.width, calibration.height), -1)
-    draw = ImageDraw.Draw(canvas)
-    for polygon in renderer.polygons(frame, side):
-        draw.polygon(polygon.points, fill=polygon.box)
-    return np.asarray(canvas)
+    return renderer.shown_boxes(sequence.frame(0), side)
 
 
 def bounds(pixels):
@@ -129,7 +118,7 @@ class TestLabelsProjectOntoObjects:
         pixels, _ = calibration.project_ego(
             corners(read.box) + calibration.radar_from_lidar_m
         )
-        mask = box_of_pixels(camera.CameraRenderer(sequence, PAIR, 0), frame)
+        mask = camera.CameraRenderer(sequence, PAIR, 0).shown_boxes(frame, 0)
         np.testing.assert_allclose(mask_bounds(mask, 0), bounds(pixels), atol=1.5)
 
     def test_near_objects_hide_far_ones(self):
@@ -217,7 +206,7 @@ class TestSilhouettes:
             renderer = camera.CameraRenderer(sequence, pair, 0, mode="oracle")
             frame = sequence.frame(0)
             images.append(renderer.render(frame))
-        image, mask = images[0], box_of_pixels(renderer, frame)
+        image, mask = images[0], renderer.shown_boxes(frame, 0)
         np.testing.assert_array_equal(images[1], image)
         np.testing.assert_array_equal(image[:, :320].any(-1), mask >= 0)
         far, near, person = (
