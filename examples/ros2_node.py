@@ -26,7 +26,7 @@ def box_fields(detections, shift_z_m):
 def point_bytes(points: Points) -> tuple[list[str], bytes]:
     """Returns the names of the float32 fields of a point cloud and its little-endian content."""
     names = ["x", "y", "z", "doppler_mps", "power_db"]
-    return names, np.stack(points, -1).astype("<f4").tobytes()
+    return names, np.stack(points[:5], -1).astype("<f4").tobytes()
 
 
 @click.command()

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import pathlib
+import time
 from typing import Any
 
 import click
 
 import radejax
 from radejax.cli import entry
-from radejax.core.errors import UserError
+from radejax.core.errors import DataError, UserError
 
 _new_root = click.option(
     "--out", required=True, type=entry.FOLDER, help="Root of the new dataset."
@@ -179,6 +180,79 @@ def reduce(roots: tuple[str, ...], out: pathlib.Path, **options: Any) -> None:
     report = reduce_dataset(roots, out, **options)
     click.echo(report.to_text())
     if report.skipped:
+        raise SystemExit(entry.FAILED)
+
+
+@click.command(cls=entry.Command)
+@click.argument("paths", nargs=-1, required=True, type=entry.EXISTING)
+@click.option("--out", required=True, type=entry.FOLDER, help="Folder of the points.")
+@click.option(
+    "--to",
+    "suffix",
+    type=click.Choice(["npy", "pcd", "bin"]),
+    default="npy",
+    help="Format: .npy as K-Radar's rpc files, .pcd of PCL, or float32 without a header.",
+)
+@click.option(
+    "--method",
+    type=click.Choice(["percentile", "cfar"]),
+    default="percentile",
+    help="percentile: the strongest cells. cfar: bins above their neighborhood.",
+)
+@click.option(
+    "--rate",
+    type=entry.FRACTION,
+    default=0.01,
+    help="Fraction of the cells (percentile only).",
+)
+@click.option(
+    "--threshold-db",
+    type=entry.NUMBER,
+    default=9.0,
+    help="Power above the mean of the neighborhood (cfar only).",
+)
+@entry.sequences
+@entry.weather
+def points(
+    paths: tuple[str, ...],
+    out: pathlib.Path,
+    suffix: str,
+    sequence_numbers: tuple[int, ...] | None,
+    weather: tuple[str, ...] | None,
+    **options: Any,
+) -> None:
+    """Write radar points of radar tensors, projections, polar3d or rpc files.
+
+    PATHS are files and folders. OUT/SEQUENCE/rpc_FRAME has the columns of K-Radar's rpc
+    files. Existing files are replaced. Files that are corrupted are skipped and listed,
+    with exit code 1.
+
+    Example: radejax points /disk1/kradar --to pcd --method cfar --out clouds
+    """
+    import tqdm
+
+    from radejax.data.kradar.dataset import read_grid
+    from radejax.data.points import read_points, write_points
+    from radejax.data.records import PreprocessReport
+    from radejax.inference.detect_files import find_frames, sequence_folder
+
+    frames, skipped = find_frames(paths, sequence_numbers, weather), dict[str, str]()
+    folders = {path: sequence_folder(path) for path in frames}
+    roots = {folder.parent for folder in folders.values()}
+    grid = read_grid(sorted({*map(pathlib.Path, paths), *roots}))
+    began = time.perf_counter()
+    for path, folder in tqdm.tqdm(folders.items(), "points", unit="frame"):
+        name = f"rpc_{path.stem.rpartition('_')[2]}.{suffix}"
+        try:
+            cloud = read_points(path, grid, **options)
+        except (DataError, OSError) as error:
+            skipped[str(path)] = str(error)
+            continue
+        write_points(out / folder.name / name, cloud)
+    seconds = time.perf_counter() - began
+    report = PreprocessReport(len(frames), 0, skipped, seconds)
+    click.echo(report.to_text())
+    if skipped:
         raise SystemExit(entry.FAILED)
 
 

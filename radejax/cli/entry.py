@@ -194,7 +194,7 @@ class _Number(click.FloatRange):
 
 COUNT = click.IntRange(1)
 FRACTION = _Number(0, 1)
-METERS = _Number()
+NUMBER = _Number()
 FILE = click.Path(path_type=pathlib.Path, dir_okay=False)
 FOLDER = click.Path(path_type=pathlib.Path, file_okay=False)
 EXISTING = click.Path(exists=True)

@@ -91,7 +91,7 @@ _PREDICTIONS = together(
     click.option(
         "--z-offset",
         "z_offset_m",
-        type=entry.METERS,
+        type=entry.NUMBER,
         help="Meters to add to the z of predictions.",
     ),
     click.option(

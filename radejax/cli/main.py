@@ -5,14 +5,14 @@ from __future__ import annotations
 import click
 
 from radejax.cli import entry
-from radejax.cli.data import data, embed, preprocess, reduce, simulate
+from radejax.cli.data import data, embed, points, preprocess, reduce, simulate
 from radejax.cli.detect import detect, export
 from radejax.cli.evaluate import compare, evaluate, score
 from radejax.cli.figures import demo, overlay, view
 from radejax.cli.train import train
 
 _COMMANDS = (
-    *(demo, simulate, data, reduce, preprocess, overlay, view),
+    *(demo, simulate, data, reduce, points, preprocess, overlay, view),
     *(train, evaluate, score, compare, detect, embed, export),
 )
 

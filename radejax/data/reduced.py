@@ -96,8 +96,7 @@ def project_reduced(
         DataError: Shape, type or scale differ from those of the release, or a point does
             not lie at a bin of the grid.
     """
-    if frame.ndim == 2 and frame.shape[1] == 5:
-        frame = frame[frame[:, :3].any(axis=1)]
+    frame = _with_direction(frame)
     check_layout(frame, grid, name)
     projection = np.empty(grid.projection_shape, np.float32)
     if frame.ndim == 2:
@@ -170,14 +169,58 @@ def strongest_points(
     power, doppler = polar
     axes = (1, 2) if range_wise else None
     bins = np.nonzero(power > np.quantile(power, 1 - rate, axis=axes, keepdims=True))
+    return points_of_bins(bins, power[bins], doppler[bins], grid)
+
+
+def to_polar(
+    frame: Real[np.ndarray, "..."], grid: RadarGrid, name: str = "frame"
+) -> Polar:
+    """Returns a frame of a reduced release as `polar3d` array.
+
+    Cells without a point have no power. Points `[N, 5]` at range 0 are left out.
+
+    Raises:
+        DataError: As for `project_reduced`.
+    """
+    project_reduced(frame, grid, name)  # checks the values
+    if frame.ndim > 2:
+        return frame
+    frame, polar = _with_direction(frame), np.zeros(polar_shape(grid))
+    r, a, e = _bins_of_points(frame, grid, name)
+    polar[:, r, a, e] = frame[:, 3:5].T
+    return polar
+
+
+def _with_direction(frame: Real[np.ndarray, "..."]) -> Real[np.ndarray, "..."]:
+    """Returns a frame without points `[N, 5]` whose range is 0."""
+    is_short = frame.ndim == 2 and frame.shape[1] == 5
+    return frame[frame[:, :3].any(axis=1)] if is_short else frame
+
+
+def points_of_bins(
+    bins: tuple[Int[np.ndarray, " N"], ...],
+    power: Float[np.ndarray, " N"],
+    doppler_mps: Float[np.ndarray, " N"],
+    grid: RadarGrid,
+) -> Float[np.ndarray, "N 11"]:
+    """Returns points in the columns of an `rpc` file.
+
+    Args:
+        bins: Range, azimuth and elevation bins.
+        power: Power in `POWER_UNIT`.
+        doppler_mps: Doppler velocity.
+        grid: Axes of the radar. Without elevation bins, the elevation is 0.
+    """
     x, y, z, *angles = _points_at(bins, grid)
-    return np.stack([x, y, z, power[bins], doppler[bins], *angles, *bins], axis=1)
+    return np.stack([x, y, z, power, doppler_mps, *angles, *bins], axis=1)
 
 
 def _points_at(bins: Any, grid: RadarGrid) -> Float[np.ndarray, "6 N"]:
     """Returns x, y, z, range, azimuth and elevation of bins, in the signs of points."""
     r = grid.range_m[bins[0]]
-    azimuth, elevation = -grid.azimuth_rad[bins[1]], -grid.elevation_rad[bins[2]]
+    azimuth, elevation = -grid.azimuth_rad[bins[1]], np.zeros(r.shape)
+    if grid.num_elevation:
+        elevation = -grid.elevation_rad[bins[2]]
     ground = r * np.cos(elevation)
     xyz = ground * np.cos(azimuth), ground * np.sin(azimuth), r * np.sin(elevation)
     return np.stack([*xyz, r, azimuth, elevation])

@@ -29,7 +29,7 @@ import numpy as np
 from jaxtyping import Float, Real
 
 from radejax.core.archives import read_npy, wrap_read_errors
-from radejax.core.errors import DataError
+from radejax.core.errors import DataError, require
 from radejax.core.files import PathLike, as_path
 from radejax.data.projection import (
     MAX_LEVEL,
@@ -38,7 +38,14 @@ from radejax.data.projection import (
     project_columns,
     project_tensor,
 )
-from radejax.data.reduced import check_layout, is_reduced_file, project_reduced
+from radejax.data.reduced import (
+    Polar,
+    check_layout,
+    is_reduced_file,
+    project_reduced,
+    reduce_tensor,
+    to_polar,
+)
 from radejax.geometry.radar_grid import RadarGrid
 
 VARIABLE = "arrDREA"
@@ -154,6 +161,33 @@ def read_frame(path: PathLike, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
         return project_reduced(read_npy(path, mapped=True), grid, str(path))
     projection = read_projection_npy(path, projection_shape=grid.projection_shape)
     return projection.astype(np.float32)
+
+
+def read_polar(path: PathLike, grid: RadarGrid) -> Polar:
+    """Return mean power and mean Doppler of all cells, see `radejax.data.reduced`.
+
+    Args:
+        path: Radar tensor, or frame of a reduced release.
+        grid: Axes of the radar, with elevation and at least two Doppler bins.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        UserError: The grid has too few bins.
+        DataError: The file is corrupted, has another shape than the grid, or is a
+            projection, which has no mean power.
+    """
+    least = min(grid.num_doppler - 1, grid.num_elevation)
+    expected = "at least (2, 2, 1, 2): Doppler, range, elevation, azimuth"
+    require(least > 0, "shape of the radar's grid", grid.shape_drea, expected)
+    if is_reduced_file(path):
+        return to_polar(read_npy(path), grid, str(path))
+    if pathlib.Path(path).suffix == ".npy":
+        raise DataError(
+            f"{path}: a projection, which has no mean power of cells; expected a radar "
+            "tensor, polar3d or rpc file"
+        )
+    project_file(path, shape_drea=grid.shape_drea)  # checks the values
+    return reduce_tensor(read_tesseract(path), grid)
 
 
 def check_frame(path: PathLike, grid: RadarGrid, *, deep: bool = False) -> None:

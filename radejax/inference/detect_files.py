@@ -66,7 +66,7 @@ def find_frames(
             raise FileNotFoundError(f"no such file or folder: {path}")
         is_file = path.is_file()
         found.update([path] if is_file else files.find_files(path, *PATTERNS))
-    folders = {_sequence(path) for path in found}
+    folders = {sequence_folder(path) for path in found}
     if sequence_numbers:
         folders = {f for f in folders if sequence_number(f) in sequence_numbers}
     if weather:
@@ -74,9 +74,9 @@ def find_frames(
         descriptions = {f: read_description(f / "description.txt") for f in folders}
         folders = {f for f in folders if descriptions[f].weather in weather}
     frames = {
-        (_sequence(path), path.stem.removeprefix("DERA_")): path
+        (sequence_folder(path), path.stem.removeprefix("DERA_")): path
         for path in sorted(found, key=lambda path: (path.suffix == ".npy", path))
-        if _sequence(path) in folders
+        if sequence_folder(path) in folders
     }
     if not frames:
         asked = map(str, [*paths, *(sequence_numbers or ()), *(weather or ())])
@@ -86,7 +86,8 @@ def find_frames(
     return sorted(frames.values())
 
 
-def _sequence(path: pathlib.Path) -> pathlib.Path:
+def sequence_folder(path: pathlib.Path) -> pathlib.Path:
+    """Returns the folder of the sequence of a radar file."""
     folder = path.absolute().parent
     return folder if is_reduced_file(path) else folder.parent
 
@@ -122,10 +123,10 @@ def front_images(
         files.as_path(root).absolute() for root in roots if files.as_path(root).is_dir()
     }
     others = {root for root in others if any(map(sequence_number, root.iterdir()))}
-    others -= {_sequence(path).parent for path in paths}
+    others -= {sequence_folder(path).parent for path in paths}
     sequences = [
         folder
-        for folder in {_sequence(path) for path in paths}
+        for folder in {sequence_folder(path) for path in paths}
         if sequence_number(folder) is not None
         and (labels or others or any(folder.glob("info_label*")))
     ]
@@ -379,5 +380,5 @@ def key_of(path: pathlib.Path) -> str:
     radar = path.stem
     for pattern in ("DERA_*", *PATTERNS):
         radar = radar.removeprefix(pattern.partition("*")[0])
-    sequence = _sequence(path).name
+    sequence = sequence_folder(path).name
     return frame_key(f"{sequence}/{radar}" if sequence else radar)

@@ -161,6 +161,31 @@ def test_other_roots_are_wrong_use(
     assert "rate is 0.0, expected" in _run("reduce", tensors, *words, code=2).output
 
 
+def test_points_of_two_disks(
+    disks: Any, tensors: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    release, (radar, others), _ = disks
+    (radar / "9").mkdir(exist_ok=True)
+    (radar / "9" / f"{release}_00001.npy").write_bytes(b"no array")
+    words = ("--rate", 0.1, "--out", tmp_path / "found")
+    text = _run("points", radar, others, *words, code=1).output
+    (radar / "9" / f"{release}_00001.npy").unlink()
+    (radar / "9").rmdir()
+    assert "12 preprocessed, 1 skipped" in text
+    assert f"skipped {radar / '9' / release}_00001.npy: " in text
+    expected = tmp_path / "expected"
+    _run("points", tensors, "--rate", 0.1, "--out", expected)
+    paths = sorted(expected.glob("*/rpc_*.npy"))
+    assert len(paths) == 12
+    for path in paths:
+        found = np.load(tmp_path / "found" / path.relative_to(expected))
+        np.testing.assert_array_equal(found, np.load(path))
+        assert found.shape[1] == 11
+    words = ("--to", "pcd", "--method", "cfar", "--threshold-db", 3)
+    _run("points", radar, others, *words, "--sequences", 1, "--out", tmp_path / "c")
+    assert len(list((tmp_path / "c").glob("1/rpc_*.pcd"))) == 4
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("one_device")
 @pytest.mark.parametrize("doppler_bins", [4, 0])

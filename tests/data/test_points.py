@@ -3,9 +3,18 @@
 import numpy as np
 import pytest
 
-from radejax.core.errors import DataError
-from radejax.data.points import cfar_points, local_mean_db, read_lidar
+from radejax.core.errors import DataError, UserError
+from radejax.data.kradar.write import write_tesseract
+from radejax.data.points import (
+    POINT_FIELDS,
+    cfar_points,
+    local_mean_db,
+    read_lidar,
+    read_points,
+    write_points,
+)
 from radejax.data.projection import project_tensor
+from radejax.data.reduced import points_of_bins, reduce_tensor, strongest_points
 from radejax.geometry.radar_grid import RadarGrid
 
 from .. import small_models as small
@@ -40,7 +49,7 @@ def test_points_are_where_the_echoes_are():
 
 def test_a_constant_map_has_no_points():
     points = cfar_points(np.full(GRID.projection_shape, 0.5, np.float32), GRID)
-    assert [column.shape for column in points] == [(0,)] * 5
+    assert [column.shape for column in points] == [(0,)] * 8
 
 
 @pytest.mark.parametrize("absent", ["elevation_rad", "doppler_mps"])
@@ -105,3 +114,104 @@ def test_other_lidar_files_are_named(tmp_path, old, new, message):
     path.write_bytes(PCD.replace(old, new).encode("latin-1"))
     with pytest.raises(DataError, match=message):
         read_lidar(path)
+
+
+# Points of radar files ----------------------------------------------------------------
+
+
+def radar_file(folder, form, power):
+    """Writes a frame of a radar tensor in one of the forms and returns its path."""
+    if form == "tesseract":
+        path = folder / "tesseract_00001.mat"
+        write_tesseract(path, power)
+        return path
+    path, array = folder / f"{form}_00001.npy", reduce_tensor(power, GRID)
+    if form == "rpc":
+        array = strongest_points(array, GRID, 0.1)
+    if form == "DERA_tesseract":
+        array = project_tensor(power).transpose(2, 0, 1)
+    np.save(path, array)
+    return path
+
+
+def noise_with_echo():
+    rng = np.random.default_rng(0)
+    power = (1e9 * rng.standard_exponential(GRID.shape_drea)).astype(np.float32)
+    power[6, 30, 4, 40] = 1e13
+    return power
+
+
+@pytest.mark.parametrize("form", ["tesseract", "polar3d", "rpc"])
+def test_the_strongest_cells_are_the_same_in_every_form(tmp_path, form):
+    power = noise_with_echo()
+    expected = strongest_points(reduce_tensor(power, GRID), GRID, 0.01)
+    found = read_points(radar_file(tmp_path, form, power), GRID, rate=0.01)
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_all_points_of_a_file_are_returned_if_it_has_fewer(tmp_path):
+    path = radar_file(tmp_path, "rpc", noise_with_echo())
+    np.testing.assert_array_equal(read_points(path, GRID, rate=0.5), np.load(path))
+
+
+@pytest.mark.parametrize("form", ["tesseract", "DERA_tesseract", "polar3d", "rpc"])
+def test_cfar_finds_the_echo_in_every_form(tmp_path, form):
+    path = radar_file(tmp_path, form, noise_with_echo())
+    found = read_points(path, GRID, "cfar", threshold_db=25.0)
+    (point,) = found
+    np.testing.assert_array_equal(point[8:], [30, 40, 4])
+    expected = points_of_bins(
+        (np.array([30]), np.array([40]), np.array([4])), *found[:, 3:5].T, GRID
+    )
+    np.testing.assert_allclose(found, expected)
+    assert point[4] == pytest.approx(GRID.doppler_mps[6], abs=0.02)
+    # The mean over 7 Doppler bins, of which one has the echo.
+    divisor = 7 if form in ("polar3d", "rpc") else 1
+    assert point[3] == pytest.approx(1 / divisor, rel=0.01)
+
+
+def test_projections_have_no_mean_power(tmp_path):
+    path = radar_file(tmp_path, "DERA_tesseract", noise_with_echo())
+    with pytest.raises(DataError, match="a projection, which has no mean power"):
+        read_points(path, GRID)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"method": "peaks"}, "method is 'peaks'"), ({"rate": 1.0}, r"rate is 1\.0")],
+)
+def test_invalid_options_are_named(tmp_path, options, message):
+    path = radar_file(tmp_path, "polar3d", noise_with_echo())
+    with pytest.raises(UserError, match=message):
+        read_points(path, GRID, **options)
+
+
+def test_percentiles_need_doppler_and_elevation_bins(tmp_path):
+    path = tmp_path / "tesseract_00001.mat"
+    grid = small.uneven_grid(elevation_rad=np.array([]))
+    write_tesseract(path, np.ones(grid.shape_drea, np.float32))
+    with pytest.raises(UserError, match="shape of the radar's grid is"):
+        read_points(path, grid)
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_points_are_written_in_three_formats(tmp_path, count):
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(count, len(POINT_FIELDS)))
+    for suffix in ("npy", "pcd", "bin"):
+        write_points(tmp_path / f"points.{suffix}", points)
+    np.testing.assert_array_equal(np.load(tmp_path / "points.npy"), points)
+    stored = np.fromfile(tmp_path / "points.bin", "<f4").reshape(-1, 11)
+    np.testing.assert_array_equal(stored, points.astype(np.float32))
+    header, _, body = (tmp_path / "points.pcd").read_bytes().partition(b"DATA binary\n")
+    lines = dict(line.split(" ", 1) for line in header.decode().splitlines())
+    assert lines["FIELDS"].split() == list(POINT_FIELDS)
+    assert lines["SIZE"].split() == ["4"] * 11
+    assert lines["TYPE"].split() == ["F"] * 11
+    assert lines["COUNT"].split() == ["1"] * 11
+    assert (lines["WIDTH"], lines["HEIGHT"], lines["POINTS"]) == (
+        str(count),
+        "1",
+        str(count),
+    )
+    assert body == stored.tobytes()

@@ -13,9 +13,9 @@ from tqdm import tqdm
 from radejax.core.errors import DataError, require
 from radejax.core.files import PathLike, as_path, atomic_write
 from radejax.data.kradar.dataset import find_sequences, read_grid
-from radejax.data.records import PreprocessReport, describe_grid
-from radejax.data.reduced import reduce_tensor, strongest_points
-from radejax.data.tesseract import project_file, read_tesseract
+from radejax.data.records import PreprocessReport
+from radejax.data.reduced import strongest_points
+from radejax.data.tesseract import read_polar
 
 _LEFT_OUT = shutil.ignore_patterns("radar_tesseract", "DERA_tesseract", "records*")
 
@@ -36,14 +36,12 @@ def reduce_dataset(
 
     Raises:
         FileNotFoundError: A root does not exist.
-        UserError: The rate is out of its range.
+        UserError: The rate is out of its range, or the grid has too few bins.
         DataError: The folders are ambiguous.
     """
     require(0 < rate < 1, "rate", rate, "a number above 0 and below 1")
     began, out, paths = time.perf_counter(), as_path(out), list(map(as_path, roots))
     grid, targets = read_grid(paths), {}
-    least = min(grid.num_doppler - 1, grid.num_elevation)
-    require(least > 0, "the radar's grid", describe_grid(grid), "four axes")
     for root in paths:
         shutil.copytree(root, out, False, _LEFT_OUT, _link, dirs_exist_ok=True)
     for folder in find_sequences(paths).values():
@@ -54,8 +52,7 @@ def reduce_dataset(
     skipped = {}
     for path in tqdm(missing, "reduce", unit="frame"):
         try:
-            project_file(path, shape_drea=grid.shape_drea)  # checks the values
-            frame = reduce_tensor(read_tesseract(path), grid)
+            frame = read_polar(path, grid)
         except (DataError, OSError) as error:
             skipped[str(path)] = str(error)
             continue
