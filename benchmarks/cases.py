@@ -27,11 +27,7 @@ from radejax.data.projection import project_jax, project_tensor
 from radejax.data.tesseract import project_file
 from radejax.evaluation import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOLS
-from radejax.evaluation.results import (
-    EvaluationOptions,
-    compute_results,
-    condition_masks,
-)
+from radejax.evaluation.results import EvaluationOptions, compute_results
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.export import export
 from radejax.inference.exported_loader import load as load_exported
@@ -105,7 +101,7 @@ def evaluate(machine):
 
         def everything(truth=truth, found=found, frames=frames, options=options):
             data = EvaluationSet(truth, found, frames=frames)
-            compute_results(data, options, condition_masks(frames, "weather"))
+            compute_results(data, frames, options)
 
         yield Case(
             name=f"evaluation of the test split, {len(found['frame']):,} predictions",

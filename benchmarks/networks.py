@@ -118,7 +118,7 @@ def step_of(config, model, variables, batch, precision):
 
     The step keeps its state between calls. It takes a batch, by default the one given here.
     """
-    optimizer = make_optimizer(lambda _: 1e-4, weight_decay=0.01)
+    optimizer = make_optimizer(config.train, lambda _: 1e-4)
     state = create_state(
         jax.tree.map(jnp.array, variables),
         optimizer,

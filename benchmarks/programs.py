@@ -95,7 +95,7 @@ def train_step(config, grid, size):
     """Returns the training step, and the shapes of its arguments."""
     model = models.build(config.model)
     _, (variables, *_) = detector(config, grid, size)
-    optimizer = make_optimizer(lambda _: 1e-3, weight_decay=0.01)
+    optimizer = make_optimizer(config.train, lambda _: 1e-3)
     create = functools.partial(
         create_state,
         optimizer=optimizer,

@@ -85,6 +85,9 @@ def test_from_an_empty_folder_to_metrics_and_figures(undisturbed: tuple) -> None
     assert {row["space"] for row in rows} == {"bev", "3d"}
     assert {float(row["iou"]) for row in rows} == {0.3, 0.5}
     assert list((run / "evaluation" / "figures").glob("*.png"))
+    worst = _metrics(folder)["worst_frames"]
+    drawn = {path.name for path in (run / "evaluation" / "worst_frames").iterdir()}
+    assert drawn == {f"{x['sequence']:02d}_{x['name']}.png" for x in worst}
     assert all(row["name"].endswith("/simulated") for row in rows)
     tables = (run / "evaluation" / "tables.md").read_text()
     titles = [line for line in tables.splitlines() if line.startswith("**")]

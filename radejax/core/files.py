@@ -38,7 +38,6 @@ def atomic_path(path: PathLike) -> Iterator[pathlib.Path]:
         DiskFullError: No space is left on the disk.
     """
     path = as_path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     temporary = _temporary_path(path)
     try:
         with disk_full(path):
@@ -69,7 +68,6 @@ def swapped_in(folder: PathLike) -> Iterator[pathlib.Path]:
         DiskFullError: No space is left on the disk.
     """
     folder = as_path(folder)
-    folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = _temporary_path(folder)
     remove_stale(folder.parent, f".{folder.name}.")
     try:
@@ -97,6 +95,8 @@ def write_json(path: PathLike, value: Any) -> None:
 
 
 def _temporary_path(path: pathlib.Path) -> pathlib.Path:
+    """Returns a path next to another one, whose missing parent folders are created."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     return path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.tmp")
 
 

@@ -15,7 +15,7 @@ from radejax.core.errors import DataError, UserError
 from radejax.core.structures import CLASSES, Boxes
 from radejax.evaluation import boxes, matching, protocols
 from radejax.evaluation.boxes import AnyColumns, Roi
-from radejax.evaluation.protocols import Curve, Protocol
+from radejax.evaluation.protocols import Curve
 from radejax.geometry.rotated_iou import bev_intersection, shared_height
 
 T = TypeVar("T")
@@ -318,7 +318,7 @@ class EvaluationSet:
             raise UserError(
                 f"iou_thresholds is {iou_thresholds}, expected numbers in [0, 1)"
             )
-        frame_weights = self.frame_weights(empty_frames, weights)
+        frame_weights = self._frame_weights(empty_frames, weights)
         points = () if curves else ("precision", "recall", "score")
         dropped = dict.fromkeys(points, np.zeros(0))
         num_frames = (frame_weights > 0).sum(axis=0).tolist()
@@ -326,8 +326,23 @@ class EvaluationSet:
         for space, iou, (index, name) in itertools.product(
             spaces, ious, enumerate(self.classes)
         ):
+            # Protocols with the same geometry and matching share their rankings.
+            matched_by = chosen.geometry, chosen.matching, space, iou
+            ranked = self._once(self._ranking, matched_by, score_threshold, index)
             weight = frame_weights[:, index]
-            curve = self.curve(chosen, space, iou, score_threshold, index, weight)
+            num_gt = int(weight @ self.gt_count[:, index])
+            if chosen.matching == "kradar":
+                matched, events, detections = (
+                    (score, count * weight[frame]) for score, frame, count in ranked
+                )
+                curve = protocols.kradar_curve(
+                    matched, events, detections, num_gt, chosen.curve
+                )
+            else:
+                ((score, frame, is_tp),) = ranked
+                curve = protocols.pooled_curve(
+                    score, is_tp, weight[frame], num_gt, chosen.curve
+                )
             result = Result(
                 cls=name,
                 space=space,
@@ -345,7 +360,7 @@ class EvaluationSet:
             results.append(result)
         return results
 
-    def frame_weights(
+    def _frame_weights(
         self, empty_frames: str, weights: Shaped[np.ndarray, " F"] | None
     ) -> Int[np.ndarray, "F C"]:
         """Returns the weights of the frames for every class; ignored frames have 0."""
@@ -356,32 +371,6 @@ class EvaluationSet:
         if empty_frames == "frame":
             counts = counts * (self.gt_count.sum(axis=1, keepdims=True) > 0)
         return np.broadcast_to(counts, self.gt_count.shape)
-
-    def curve(
-        self,
-        protocol: Protocol,
-        space: str,
-        iou: float,
-        score_threshold: float,
-        cls: int,
-        weight: Int[np.ndarray, " F"],
-    ) -> Curve:
-        """Computes the curve and AP of one class over weighted frames."""
-        # Protocols with the same geometry and matching share their rankings.
-        matched_by = protocol.geometry, protocol.matching, space, iou
-        ranked = self._once(self._ranking, matched_by, score_threshold, cls)
-        num_gt = int(weight @ self.gt_count[:, cls])
-        if protocol.matching == "kradar":
-            matched, events, detections = (
-                (score, count * weight[frame]) for score, frame, count in ranked
-            )
-            return protocols.kradar_curve(
-                matched, events, detections, num_gt, protocol.curve
-            )
-        ((score, frame, is_tp),) = ranked
-        return protocols.pooled_curve(
-            score, is_tp, weight[frame], num_gt, protocol.curve
-        )
 
     def _ranking(
         self, matched_by: tuple[str, str, str, float], threshold: float, cls: int

@@ -20,14 +20,8 @@ from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike
 from radejax.core.structures import BOX_FIELDS
 from radejax.data.kradar import KRadar
-from radejax.evaluation.boxes import (
-    Columns,
-    columns_of,
-    frame_ids,
-    tables_from_frames,
-    take,
-    with_ids,
-)
+from radejax.evaluation import boxes
+from radejax.evaluation.boxes import Columns
 from radejax.evaluation.kitti import read_kitti
 from radejax.evaluation.report import Report, write_report
 from radejax.evaluation.results import EvaluationOptions
@@ -72,7 +66,9 @@ def read_table(
             columns = {**columns, "frame": names[columns["frame"]]}
     elif path.is_dir() or path.suffix == ".json":
         parts = sorted(path.glob("*.json")) if path.is_dir() else [path]
-        columns = columns_of([row for part in parts for row in _records(part, scored)])
+        columns = boxes.columns_of(
+            [row for part in parts for row in _records(part, scored)]
+        )
     elif path.suffix == ".npz":
         columns = read_npz(path)
         if missing := [name for name in wanted if name not in columns]:
@@ -83,7 +79,7 @@ def read_table(
             "KITTI's layout"
         )
     table = {name: columns[name] for name in wanted}
-    return with_ids(table, frames, str(path), skip=path.is_dir())
+    return boxes.with_ids(table, frames, str(path), skip=path.is_dir())
 
 
 def _is_kitti(path: pathlib.Path) -> bool:
@@ -197,9 +193,9 @@ def load(
                 f"no frames of {column} {', '.join(map(str, wanted))}; there are "
                 f"{', '.join(np.unique(values))}"
             )
-        frames = take(frames, is_chosen)
+        frames = boxes.take(frames, is_chosen)
         truth, found = (
-            take(table, np.isin(table["frame"], frames["frame"]))
+            boxes.take(table, np.isin(table["frame"], frames["frame"]))
             for table in (truth, found)
         )
     return truth, found, frames, left_out
@@ -225,7 +221,7 @@ def _load_ground_truth(
             classes=classes,
         )
         counts = {f"labels: {what}": int(n) for what, n in data.counts.items()}
-        return *tables_from_frames(data, source.split), counts
+        return *boxes.tables_from_frames(data, source.split), counts
     if _is_kitti(path):
         objects, _, frames = read_kitti(path)
         return objects, frames, {}
@@ -266,7 +262,7 @@ def _read_frames(path: PathLike) -> Columns:
     content = files.read_json(path)
     try:
         columns = {name: np.asarray(values) for name, values in dict(content).items()}
-        frame_ids(columns)
+        boxes.frame_ids(columns)
         if any(column.dtype.kind == "O" for column in columns.values()):
             raise DataError("a column has values that are neither numbers nor text")
     except (TypeError, ValueError) as error:

@@ -26,18 +26,11 @@ import numpy as np
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import Detections
-from radejax.evaluation.boxes import (
-    KNOWN_CLASSES,
-    Columns,
-    columns_of,
-    frame_ids,
-    frame_positions,
-    take,
-    with_ids,
-)
+from radejax.evaluation import boxes
+from radejax.evaluation.boxes import Columns
 
 KEYS = ("sed", "bus", "ped", "mot", "bic", "peg", "big")
-CLASS_KEYS = dict(zip(KNOWN_CLASSES, KEYS, strict=True))
+CLASS_KEYS = dict(zip(boxes.KNOWN_CLASSES, KEYS, strict=True))
 CLASS_NAMES = {key: name for name, key in CLASS_KEYS.items()}
 GT_HEADER = "0.00 0 0 50 50 150 150"
 PRED_HEADER = "-1 -1 0 50 50 150 150"
@@ -77,18 +70,18 @@ def write_kitti(
         UserError: K-Radar has no key for one of the classes, or no frame has ground truth.
         DataError: A frame is not in the frame table.
     """
-    ids = frame_ids(frames)
+    ids = boxes.frame_ids(frames)
     if not len(ground_truth["frame"]):
         raise UserError("no frame has ground truth: K-Radar's tools write none of them")
     is_above = np.asarray(predictions["score"]) > score_threshold
 
     def lines(table: Columns, name: str, *, scored: bool) -> dict[int, list[str]]:
-        frame = with_ids(table, frames, name)["frame"]
-        numbered = {**table, "frame": frame_positions(frame, ids, name)}
+        frame = boxes.with_ids(table, frames, name)["frame"]
+        numbered = {**table, "frame": boxes.frame_positions(frame, ids, name)}
         return _lines(numbered, scored=scored)
 
     truth = lines(ground_truth, "ground truth", scored=False)
-    found = lines(take(predictions, is_above), "predictions", scored=True)
+    found = lines(boxes.take(predictions, is_above), "predictions", scored=True)
     root = files.as_path(folder) / f"{float(score_threshold)}"
     kinds = [kind for kind in DESCRIPTION if kind in frames]
     listed: dict[pathlib.Path, list[str]] = {}
@@ -197,7 +190,7 @@ def _read_folder(folder: pathlib.Path, *, scored: bool) -> tuple[list[int], Colu
         for number, line in enumerate(files.read_text(path).splitlines(), 1):
             if row := _read_line(line, scored, f"{path}: line {number}"):
                 rows.append((numbers[-1], *row))
-    return numbers, columns_of(rows)
+    return numbers, boxes.columns_of(rows)
 
 
 def _read_line(line: str, scored: bool, where: str) -> tuple | None:

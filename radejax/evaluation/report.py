@@ -19,12 +19,11 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import functools
 import importlib.resources
 import itertools
 import pathlib
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -39,9 +38,10 @@ from radejax.evaluation.evaluation_set import EvaluationSet, Result
 from radejax.evaluation.kitti import write_kitti
 from radejax.evaluation.results import (
     EvaluationOptions,
+    compute_results,
     condition_masks,
-    evaluate_tables,
     exclusion_counts,
+    make_set,
     to_row,
 )
 
@@ -73,7 +73,6 @@ def write_report(
     run: str = "radejax",
     left_out: Mapping[str, int] | None = None,
     warnings: Sequence[str] = (),
-    draw_frame: Callable[[int, pathlib.Path], None] | None = None,
 ) -> Report:
     """Evaluates predictions in the given protocols and `all_point`, and writes the report.
 
@@ -87,8 +86,6 @@ def write_report(
         run: Name of the run in tables.
         left_out: Counts of what was read and skipped when loading, by reason.
         warnings: Warnings of loading, which are printed in the report.
-        draw_frame: Function that is called with (frame id, path of a figure to write) for
-            each of the worst frames, or None.
 
     Raises:
         UserError: An option is invalid, or a column is missing.
@@ -97,7 +94,8 @@ def write_report(
     if protocols.RECOMMENDED not in options.protocols:
         names = (*options.protocols, protocols.RECOMMENDED)
         options = dataclasses.replace(options, protocols=names)
-    data, results = evaluate_tables(ground_truth, predictions, frames, options)
+    data = make_set(ground_truth, predictions, frames, options)
+    results = compute_results(data, frames, options)
     iou = options.iou_thresholds[0]
     settings = f"3d, IoU {iou:g}, score>{options.min_score:g}; precision and recall "
     settings += f"at score>{analysis.OPERATING_SCORE:g}"
@@ -149,14 +147,6 @@ def write_report(
             write_kitti(folder / "kitti", truth, found, frames, score_threshold=least)
         if options.plots:
             _draw_curves(data, frames, options, folder)
-        if draw_frame is not None:
-            (folder / "worst_frames").mkdir()
-            for entry in metrics["worst_frames"]:
-                name = f"frame_{entry['frame']}"
-                if {"name", "sequence"} <= set(entry):  # as in other figures
-                    name = f"{entry['sequence']:02d}_{entry['name']}"
-                path = folder / "worst_frames" / f"{name}.{options.figures}"
-                draw_frame(entry["frame"], path)
     return Report(text, metrics, results, pathlib.Path(out_dir))
 
 
@@ -226,16 +216,12 @@ def _draw_curves(
     protocol, iou = protocols.RECOMMENDED, options.iou_thresholds[0]
     suffix = ", simulated data" if data.is_simulated else ""
     masks: dict[str, Any] = {"all": None, **condition_masks(frames, "weather")}
+    settings = {"iou_thresholds": iou, **options.settings_of(protocol)}
     for space in SPACES:
         panels: dict[str, dict[str, Any]] = {}
         for name, mask in masks.items():
-            for result in data.results(
-                protocol,
-                iou_thresholds=iou,
-                spaces=space,
-                weights=mask,
-                **options.settings_of(protocol),
-            ):
+            results = data.results(protocol, spaces=space, weights=mask, **settings)
+            for result in results:
                 title = f"{result.cls}, {protocol}, {space}, IoU {iou:g}{suffix}"
                 curve = (result.recall, result.precision) if result.is_defined else None
                 label = f"{name}, AP {result.ap:.1f}"
@@ -436,6 +422,9 @@ Place = dict[str, Any]
 _ABLATIONS = ["RADE-Net, Table III", "DinoRADE, Table 4"]
 """Ablation tables, with whose rows a run is not compared."""
 
+_OF_OTHERS = ("Sedan", "Bus or Truck", "mean")
+"""Classes of most other methods."""
+
 _BOTH: list[Place] = [{"space": space} for space in SPACES]
 _USUAL: Place = {"condition": "all", "cls": "Sedan", "space": "3d", "iou": 0.3}
 
@@ -555,46 +544,39 @@ def paper_tables(
         return []
     classes = [{"cls": cls} for cls in (*options.classes, "mean")]
     conditions = [{"condition": name} for name in CONDITIONS]
-    layout = functools.partial(_layout, run, results, options, split)
-    built = [
-        layout(
+    ious = _crossed([{"iou": 0.3}, {"iou": 0.5}], _BOTH)
+    common = [group for group in classes if group["cls"] in _OF_OTHERS]
+    elsewhere = [row.source for row in PUBLISHED if ", Table" not in row.source]
+    layouts: list[tuple[str, Sequence[str], list[Place], list[Place]]] = [
+        (
+            "Sedan by weather at IoU 0.3 (layout of Table I)",
+            ["RADE-Net, Table I", "DinoRADE, Table 1"],
+            _BOTH,
+            conditions,
+        ),
+        (
             "Classes by weather at IoU 0.3 (layout of Table II)",
             ["RADE-Net, Table II", "DinoRADE, Table 2"],
             classes,
             _crossed(conditions, _BOTH),
         ),
-        layout(
+        (
             "Classes, all weathers, IoU 0.3 (layout of DinoRADE's Table 3)",
             ["DinoRADE, Table 3"],
             [{"condition": "all"}],
             _crossed(classes, _BOTH),
         ),
+        (
+            "Ablations, Sedan (layout of Table III)",
+            _ABLATIONS,
+            [{"cls": "Sedan"}],
+            ious,
+        ),
+        ("Other methods, all weathers, as printed elsewhere", elsewhere, common, ious),
     ]
     if "Sedan" not in options.classes:
-        return built
-    by_weather = layout(
-        "Sedan by weather at IoU 0.3 (layout of Table I)",
-        ["RADE-Net, Table I", "DinoRADE, Table 1"],
-        _BOTH,
-        conditions,
-    )
-    ablations = layout(
-        "Ablations, Sedan (layout of Table III)",
-        _ABLATIONS,
-        [{"cls": "Sedan"}],
-        _crossed([{"iou": 0.3}, {"iou": 0.5}], _BOTH),
-    )
-    others = layout(
-        "Other methods, all weathers, as printed elsewhere",
-        [row.source for row in PUBLISHED if ", Table" not in row.source],
-        [
-            group
-            for group in classes
-            if group["cls"] in ("Sedan", "Bus or Truck", "mean")
-        ],
-        _crossed([{"iou": 0.3}, {"iou": 0.5}], _BOTH),
-    )
-    return [by_weather, *built, ablations, others]
+        layouts = layouts[1:3]  # the others show sedans
+    return [_layout(run, results, options, split, *layout) for layout in layouts]
 
 
 def _crossed(outer: Sequence[Place], inner: Sequence[Place]) -> list[Place]:

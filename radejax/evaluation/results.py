@@ -9,7 +9,7 @@ often as its sequence was drawn, which all protocols handle exactly.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -146,46 +146,24 @@ class EvaluationOptions:
         return {"score_threshold": threshold, "empty_frames": self.empty_frames}
 
 
-def evaluate_tables(
-    ground_truth: Columns,
-    predictions: Columns,
-    frames: Columns,
-    options: EvaluationOptions,
-    *,
-    per_weather: bool = True,
-) -> tuple[EvaluationSet, list[Result]]:
-    """Evaluates predictions over all frames and over the frames of every weather.
-
-    Args:
-        ground_truth: Columns as for `evaluation.evaluate`.
-        predictions: Such columns with scores.
-        frames: Frame table.
-        options: Settings of the evaluation.
-        per_weather: Whether to also evaluate every weather of the frame table.
-
-    Returns:
-        The evaluation set and the results of all protocols. With `options.bootstrap` and
-        known sequences, they have 95 % intervals (see `compute_results`). The last class
-        of every group is "mean".
-
-    Raises:
-        UserError: An option is invalid, or a column is missing.
-        DataError: A row is invalid; the message names the table, frame and row.
-    """
-    data = make_set(ground_truth, predictions, frames, options)
-    weathers = condition_masks(frames, "weather") if per_weather else {}
-    is_resampled = options.bootstrap and "sequence" in frames
-    sequence = np.asarray(frames["sequence"]) if is_resampled else None
-    return data, compute_results(data, options, weathers, sequence)
-
-
 def make_set(
     ground_truth: Columns,
     predictions: Columns,
     frames: Columns,
     options: EvaluationOptions,
 ) -> EvaluationSet:
-    """Builds the evaluation set; repaired and clipped predictions are counted in it."""
+    """Builds the evaluation set; repaired and clipped predictions are counted in it.
+
+    Args:
+        ground_truth: Columns as for `evaluation.evaluate`.
+        predictions: Such columns with scores.
+        frames: Frame table.
+        options: Settings of the evaluation.
+
+    Raises:
+        UserError: An option is invalid, or a column is missing.
+        DataError: A row is invalid; the message names the table, frame and row.
+    """
     predictions, num_invalid = repair_sizes(predictions, options.invalid_sizes)
     sizes = np.asarray(predictions["box"], np.float64).reshape(-1, 7)[:, 3:6]
     is_clipped = ((sizes > 1e-6) & (sizes <= np.float32(MIN_SIZE_M))).any(axis=1)
@@ -205,20 +183,27 @@ def make_set(
 
 
 def compute_results(
-    data: EvaluationSet,
-    options: EvaluationOptions,
-    weathers: Mapping[str, Bool[np.ndarray, " F"]],
-    sequence: Shaped[np.ndarray, " F"] | None = None,
+    data: EvaluationSet, frames: Columns, options: EvaluationOptions
 ) -> list[Result]:
     """Computes the results of every protocol over all frames and the frames of weathers.
 
-    If the sequences are given, all protocols have intervals over all frames, and the main
-    protocols also per weather. The interval of a weather is computed by resampling its
-    sequences; there is none if it has only one sequence.
+    With `options.bootstrap` and known sequences, all protocols have intervals over all
+    frames, and the main protocols also per weather. The interval of a weather is computed
+    by resampling its sequences; there is none if it has only one sequence.
+
+    Args:
+        data: Evaluation set.
+        frames: Frame table; only its columns weather and sequence are used.
+        options: Settings of the evaluation.
+
+    Returns:
+        The results of all protocols. The last class of every group is "mean".
     """
     rows = []
+    is_resampled = options.bootstrap and "sequence" in frames
+    sequence = np.asarray(frames["sequence"]) if is_resampled else None
     everything = {"all": np.ones(data.frame.size, bool)}
-    for condition, mask in (everything | dict(weathers)).items():
+    for condition, mask in (everything | condition_masks(frames, "weather")).items():
         has_interval = (
             options.protocols if condition == "all" else options.main_protocols
         )
@@ -295,25 +280,18 @@ def resample(
     protocol: str,
     space: str,
     iou: float,
-    *,
-    empty_frames: str = "protocol",
-    score_threshold: float = 0.0,
+    **settings: Any,
 ) -> Float[np.ndarray, "B _"]:
     """Computes `[B, C + 1]` APs of every class and their mean in every resample.
 
     The AP is NaN if a resample has no object of the class. The mean is over the classes
-    that occur.
+    that occur. `settings` are further arguments of `EvaluationSet.results`.
     """
-    chosen = protocols.get_protocol(protocol)
-    empty_frames = chosen.resolve_empty_frames(empty_frames)
+    metric: dict[str, Any] = {"iou_thresholds": iou, "spaces": space, **settings}
     samples = []
     for weight in weights:
-        by_class = data.frame_weights(empty_frames, weight)
-        curves = [
-            data.curve(chosen, space, iou, score_threshold, cls, by_class[:, cls])
-            for cls in range(len(data.classes))
-        ]
-        samples.append([*(curve.ap_or_none for curve in curves), mean_ap(curves)])
+        results = data.results(protocol, weights=weight, curves=False, **metric)
+        samples.append([*(result.ap_or_none for result in results), mean_ap(results)])
     return np.array(samples, np.float64)  # None becomes NaN
 
 

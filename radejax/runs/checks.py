@@ -38,9 +38,6 @@ _VERSIONS = one_of(*VERSIONS, *(version.removeprefix("v") for version in VERSION
 _SEQUENCES = several(integer(1), "different sequence numbers; () for all")
 
 # Fields that no constructor checks, or only one that reads data.
-_RUN = {
-    "seed": _SEED,
-}
 _DATA = {
     "roots": (all, "folders"),
     "label_version": _VERSIONS,
@@ -87,7 +84,6 @@ _LOGGING = {
         "two integers of at least 0, the first not above the last",
     ),
 }
-_SIZE = integer(1)
 _GRID = dict.fromkeys(("num_doppler", "num_elevation"), integer(0))
 _GRID |= {"num_range": integer(2), "num_azimuth": integer(2), "max_range_m": POSITIVE}
 _KINDS: dict[type, Any] = {float: int | float, tuple: tuple | list}
@@ -106,7 +102,6 @@ def check(config: ConfigDict) -> None:
         UserError: A field is missing, unknown, of another type or out of its range.
     """
     _check_fields(config)
-    check_options(config, "config", _RUN)
     check_options(config.data, "config.data", _DATA)
     check_options(config.train, "config.train", _TRAIN)
     check_options(config.logging, "config.logging", _LOGGING)
@@ -114,7 +109,8 @@ def check(config: ConfigDict) -> None:
     names, expected = one_of(*LABEL_CLASSES), f"different classes of {LABEL_CLASSES}"
     if config.data.format != "kradar":
         names, expected = (lambda name: isinstance(name, str), ""), "different names"
-    check_options(config, "config", {"classes": several(names, expected, least=1)})
+    classes = several(names, expected, least=1)
+    check_options(config, "config", {"seed": _SEED, "classes": classes})
     for section, construct in (
         ("model", lambda: models.build(config.model, config.data.num_frames)),
         ("loss", lambda: LossOptions(**config.loss.to_dict())),

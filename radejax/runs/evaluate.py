@@ -21,10 +21,10 @@ from radejax.core.structures import Boxes
 from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.pipeline import require_images
 from radejax.data.projection import decode
-from radejax.evaluation.boxes import Columns, roi_bounds, tables_from_frames
+from radejax.evaluation.boxes import Columns, roi_bounds, tables_from_frames, take
 from radejax.evaluation.evaluation_set import Result
 from radejax.evaluation.report import Report, write_report
-from radejax.evaluation.results import EvaluationOptions, evaluate_tables
+from radejax.evaluation.results import EvaluationOptions, compute_results, make_set
 from radejax.inference.detector import Detector, check_backbone
 from radejax.inference.predict import predict_dataset
 from radejax.inference.saved import PathLike, SavedModel, Step, load_model
@@ -120,14 +120,13 @@ class Evaluation:
             distributed.Stopped: `should_stop` returned True.
         """
         predictions = self.predict(variables, progress=False, should_stop=should_stop)
-        options = dataclasses.replace(self._options, bootstrap=0)
-        tables = self._truth, predictions, self._table
-        _, results = evaluate_tables(*tables, options, per_weather=False)
-        aps = named_aps(results)
-        main = f"{self._config.train.best_metric}/{options.protocols[0]}/"
+        data = make_set(self._truth, predictions, self._table, self._options)
+        # Without the frame table, there are no weathers and no intervals.
+        aps = named_aps(compute_results(data, {}, self._options))
+        main = f"{self._config.train.best_metric}/{self._options.protocols[0]}/"
         best = next((ap for name, ap in aps.items() if name.startswith(main)), math.nan)
-        count = self._config.logging.num_visualizations
-        drawn = distributed.main_only(lambda: dict(self._figures(predictions, count)))
+        shown = self._spread(self._config.logging.num_visualizations)
+        drawn = distributed.main_only(lambda: dict(self._figures(predictions, shown)))
         values = {f"validation/{name}": ap for name, ap in aps.items()}
         named = {f"validation/{name}": figure for name, figure in (drawn or {}).items()}
         return Scores(values, None if math.isnan(best) else best, named)
@@ -155,9 +154,6 @@ class Evaluation:
         """
         predictions, place = self.predict(variables), out or workdir / "evaluation"
 
-        def draw(index: int, path: pathlib.Path) -> None:
-            save_figure(draw_frame(self._scene(predictions, index)), path)
-
         def write() -> Report:
             with files.swapped_in(place) as folder:
                 files.write_json(folder / "source.json", {"step": step, **self._source})
@@ -165,12 +161,12 @@ class Evaluation:
                     *(self._truth, predictions, self._table, folder, self._options),
                     run=run or workdir.name,
                     left_out=self._frames.summary().counts,
-                    draw_frame=draw,
                 )
                 _log.info("step %s, split %s\n%s", step, self._split, report.text)
                 if self._detector.takes_camera:
                     self._write_camera_share(variables, folder / "camera_share.json")
-                self._write_figures(predictions, workdir, folder)
+                worst = [entry["frame"] for entry in report.metrics["worst_frames"]]
+                self._write_figures(predictions, workdir, folder, worst)
             return dataclasses.replace(report, folder=place)
 
         return distributed.main_only(write)
@@ -186,17 +182,22 @@ class Evaluation:
         files.write_json(path, figures.average_shares(shares, grid))
 
     def _write_figures(
-        self, predictions: Columns, workdir: pathlib.Path, folder: pathlib.Path
+        self,
+        predictions: Columns,
+        workdir: pathlib.Path,
+        folder: pathlib.Path,
+        worst: Sequence[int],
     ) -> None:
         """Write figures of frames, a figure of all weathers, and the loss curves."""
         frames = self._frames
         suffix = ", simulated" if frames.is_simulated else ""
         ending = self._options.figures
-        for name, figure in self._figures(
-            predictions, self._options.num_visualizations
-        ):
-            save_figure(figure, folder / "figures" / f"{name}.{ending}")
-        if (folder / "figures").exists():  # the layout of RADE-Net's Figure 4
+        usual = self._spread(self._options.num_visualizations)
+        (folder / "worst_frames").mkdir()  # replaces that of an earlier evaluation
+        for kind, indices in (("figures", usual), ("worst_frames", worst)):
+            for name, figure in self._figures(predictions, indices):
+                save_figure(figure, folder / kind / f"{name}.{ending}")
+        if usual:  # the layout of RADE-Net's Figure 4
             scenes = [
                 self._scene(predictions, i, title=f"{name} ({frames[i].key}){suffix}")
                 for name, i in figures.fullest_of_weathers(frames).items()
@@ -221,20 +222,22 @@ class Evaluation:
             frame,
             decode(records[frame.key]),
             records.grid,
-            predictions=Boxes(
-                **{name: column[is_drawn] for name, column in found.items()}
-            ),
+            predictions=Boxes(**take(found, is_drawn)),
             roi=roi_bounds(self._options.roi),
             score_threshold=threshold,
             **fields,
         )
 
-    def _figures(
-        self, predictions: Columns, count: int
-    ) -> Iterator[tuple[str, Figure]]:
-        """Yield names and figures of a fixed selection of the split's frames with objects."""
+    def _spread(self, count: int) -> list[int]:
+        """Return the positions of a fixed selection of the split's frames with objects."""
         candidates = [i for i, frame in enumerate(self._frames) if len(frame.boxes)]
-        for index in figures.spread(candidates, count):
+        return figures.spread(candidates, count)
+
+    def _figures(
+        self, predictions: Columns, indices: Sequence[int]
+    ) -> Iterator[tuple[str, Figure]]:
+        """Yield names and figures of frames by their positions in the split."""
+        for index in indices:
             frame = self._frames[index]
             name = f"{frame.sequence:02d}_{frame.name}"
             yield name, draw_frame(self._scene(predictions, index))

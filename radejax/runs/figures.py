@@ -11,9 +11,9 @@ from jaxtyping import Float
 
 from radejax.core.structures import Boxes
 from radejax.data.dataset import FrameSequence, LabelledFrame, front_view
-from radejax.data.kradar.conditions import WEATHERS
 from radejax.data.pipeline import read_sample, sample_keys
 from radejax.data.projection import decode
+from radejax.evaluation.results import condition_masks
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.runs.data import Data
 from radejax.visualize.style import Scene
@@ -43,13 +43,10 @@ def fullest_of_weathers(frames: FrameSequence) -> dict[str, int]:
 
     The weathers are in the order of the tables, and unknown ones come last.
     """
-    fullest: dict[str, int] = {}
-    for i, frame in enumerate(frames):
-        best = fullest.setdefault(frame.weather, i)
-        if len(frame.boxes) > len(frames[best].boxes):
-            fullest[frame.weather] = i
-    names = [*WEATHERS, *sorted(set(fullest) - set(WEATHERS))]
-    return {name: fullest[name] for name in names if name in fullest}
+    counts = np.array([len(frame.boxes) for frame in frames])
+    table = {"weather": [frame.weather for frame in frames]}
+    masks = condition_masks(table, "weather")
+    return {name: int(np.where(m, counts, -1).argmax()) for name, m in masks.items()}
 
 
 def spread(values: Any, count: int) -> list[Any]:

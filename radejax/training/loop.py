@@ -97,12 +97,7 @@ def train(
     """
     options, folder = config.train, files.as_path(workdir)
     schedule = make_schedule(options, steps_per_epoch)
-    optimizer = make_optimizer(
-        schedule,
-        weight_decay=options.weight_decay,
-        gradient_clip_norm=options.gradient_clip_norm,
-        gradient_accumulation_steps=options.gradient_accumulation_steps,
-    )
+    optimizer = make_optimizer(options, schedule)
     step_fn = make_train_step(
         model, optimizer, grid, loss=loss_options(config), ema_decay=options.ema_decay
     )

@@ -87,28 +87,24 @@ def _cyclic_cosine(peak: float, minimum: float, half_period: int) -> optax.Sched
 
 
 def make_optimizer(
-    schedule: optax.Schedule,
-    *,
-    weight_decay: float,
-    gradient_clip_norm: float | None = None,
-    gradient_accumulation_steps: int = 1,
+    train: ConfigDict, schedule: optax.Schedule
 ) -> optax.GradientTransformation:
     """Creates AdamW with torch's defaults and weight decay on every parameter.
 
+    The mean gradient of `gradient_accumulation_steps` steps updates the parameters, see
+    `optax.MultiSteps`. It is clipped to the global norm `gradient_clip_norm` unless this
+    is None.
+
     Args:
+        train: The section `config.train`.
         schedule: Function from the step to the learning rate.
-        weight_decay: Decoupled weight decay.
-        gradient_clip_norm: Global norm to which the gradient is clipped; None does not
-            clip.
-        gradient_accumulation_steps: Number of steps whose mean gradient updates the
-            parameters, see `optax.MultiSteps`.
     """
-    count = gradient_accumulation_steps
+    count = train.gradient_accumulation_steps
     # The optimizer counts updates, while the schedule takes steps.
-    adamw = optax.adamw(lambda n: schedule(n * count), weight_decay=weight_decay)
+    adamw = optax.adamw(lambda n: schedule(n * count), weight_decay=train.weight_decay)
     parts: list[optax.GradientTransformation] = [adamw]
-    if gradient_clip_norm is not None:
-        parts.insert(0, optax.clip_by_global_norm(gradient_clip_norm))
+    if train.gradient_clip_norm is not None:
+        parts.insert(0, optax.clip_by_global_norm(train.gradient_clip_norm))
     optimizer: optax.GradientTransformation = optax.chain(*parts)
     if count > 1:
         return optax.MultiSteps(optimizer, count).gradient_transformation()

@@ -18,17 +18,7 @@ from radejax.core.errors import UserError
 from radejax.core.structures import Boxes
 from radejax.geometry.boxes import corners
 from radejax.geometry.camera import CameraCalibration
-from radejax.visualize.style import (
-    Label,
-    Style,
-    draw_labels,
-    draw_lines,
-    draw_points,
-    label_texts,
-    line_scales,
-    new_figure,
-    styled_sets,
-)
+from radejax.visualize import style
 
 _FRONT = [0, 3, 7, 4]  # front face in geometry.boxes.corners
 _MIN_LABEL_HEIGHT_PT = 12.0  # height of a box in the figure
@@ -78,7 +68,7 @@ def draw_camera(
         width = 9.0
         height = width * aspect * calibration.height / calibration.width
         total = height + (0.35 if title else 0.0)
-        ax = new_figure(width, total).add_axes((0, 0, 1, height / total))
+        ax = style.new_figure(width, total).add_axes((0, 0, 1, height / total))
     ax.imshow(image, interpolation="bilinear", aspect=aspect)
     ax.set_axis_off()
     # Pixel centers are integers in imshow and half-integers in the calibration.
@@ -86,20 +76,20 @@ def draw_camera(
     ax.apply_aspect()
     if lidar_m is not None:
         pixels, depth_m = calibration.project_ego(lidar_m)
-        draw_points(ax, pixels[calibration.in_image(pixels, depth_m)] - 0.5)
+        style.draw_points(ax, pixels[calibration.in_image(pixels, depth_m)] - 0.5)
     labels = []
-    for style, boxes in styled_sets(ground_truth, predictions):
-        labels += _draw_boxes(ax, calibration, boxes, style)
+    for look, boxes in style.styled_sets(ground_truth, predictions):
+        labels += _draw_boxes(ax, calibration, boxes, look)
     if show_labels:  # near boxes first
         labels.sort(key=lambda label: -np.ptp(label.outline[:, 1]))
-        draw_labels(ax, labels, 6.5)
+        style.draw_labels(ax, labels, 6.5)
     ax.set_title(title)
     return ax
 
 
 def _draw_boxes(
-    ax: Axes, calibration: CameraCalibration, boxes: Boxes, style: Style
-) -> list[Label]:
+    ax: Axes, calibration: CameraCalibration, boxes: Boxes, look: style.Style
+) -> list[style.Label]:
     """Draw the boxes in front of the camera; return labels of boxes that are large enough."""
     segments, is_visible = calibration.project_boxes(boxes.box, near_m=_NEAR_M)
     segments = segments - 0.5
@@ -111,17 +101,17 @@ def _draw_boxes(
     fronts = [
         points[i, _FRONT] - 0.5 for i in drawn if (depth[i, _FRONT] > _NEAR_M).all()
     ]
-    tint = PolyCollection(fronts, facecolors=style.color, alpha=0.25, lw=0, zorder=3)
+    tint = PolyCollection(fronts, facecolors=look.color, alpha=0.25, lw=0, zorder=3)
     ax.add_collection(tint, autolim=False)
     hulls = [segments[i][is_visible[i]].reshape(-1, 2) for i in drawn]
-    widths = np.repeat(line_scales(ax, hulls, 18.0), is_visible[drawn].sum(1))
+    widths = np.repeat(style.line_scales(ax, hulls, 18.0), is_visible[drawn].sum(1))
     lines = [line for i in drawn for line in segments[i][is_visible[i]]]
-    draw_lines(ax, lines, style.color, 0.9 * style.width * widths)
-    texts = label_texts(boxes)
+    style.draw_lines(ax, lines, look.color, 0.9 * look.width * widths)
+    texts = style.label_texts(boxes)
     side = "above" if boxes.score is None else "below"
     labels = []
     for i, hull in zip(drawn, hulls, strict=True):
         height_px = np.ptp(ax.transData.transform(hull)[:, 1])
         if height_px * 72 / ax.figure.dpi >= _MIN_LABEL_HEIGHT_PT:
-            labels.append(Label(hull, texts[i], style.text_color, side))
+            labels.append(style.Label(hull, texts[i], look.text_color, side))
     return labels

@@ -28,25 +28,9 @@ from radejax.core.errors import UserError
 from radejax.core.structures import ROIS
 from radejax.geometry.boxes import bev_corners, corners
 from radejax.geometry.radar_grid import RadarGrid, values_at
+from radejax.visualize import style
 from radejax.visualize.camera import draw_camera
-from radejax.visualize.style import (
-    COLOR_MAP,
-    GROUND_TRUTH,
-    LIDAR_COLOR,
-    ROI_COLOR,
-    Label,
-    Scene,
-    color_limits_of,
-    draw_labels,
-    draw_lines,
-    draw_points,
-    draw_tiles,
-    footprints,
-    halo,
-    label_texts,
-    line_scales,
-    new_figure,
-)
+from radejax.visualize.style import Scene
 
 Extent = tuple[float, float, float, float]
 """x_min, x_max, y_min, y_max in meters."""
@@ -104,7 +88,7 @@ def draw_map(
     edges = grid.bin_to_ego(range_bin[:, None], azimuth_bin[None])  # [R'+1, A+1, 2]
     ax.set_facecolor(_OUTSIDE_COLOR)
     shown = values[first:last]
-    mesh = draw_tiles(ax, edges[..., 1], edges[..., 0], shown, color_limits)
+    mesh = style.draw_tiles(ax, edges[..., 1], edges[..., 0], shown, color_limits)
     # The y axis increases to the left, as in a view from above with x pointing up.
     ax.set(xlim=(y1, y0), ylim=(x0, x1), xlabel="y, left [m]", ylabel="x, ahead [m]")
     ax.set_aspect("equal")
@@ -129,16 +113,7 @@ def draw_bev(scene: Scene, *, color_limits: tuple[float, float] | None = None) -
         The axes; `.figure` is the figure.
     """
     ax = _draw_ground(scene, color_limits=color_limits, label=POWER_LABEL)
-    if handles := _legend_handles(scene):
-        ax.legend(
-            handles=handles,
-            loc="lower center",
-            bbox_to_anchor=(0.5, 1.0),
-            ncols=len(handles),
-            fontsize=8,
-            frameon=False,
-            handlelength=1.6,
-        )
+    _add_legend(ax, scene, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4)
     ax.set_title(scene.title, pad=24)
     return ax
 
@@ -148,7 +123,7 @@ def _draw_ground(scene: Scene, **options: Any) -> Axes:
     extent = _extent_m(scene.grid, scene.roi)
     ax = draw_map(scene.power, scene.grid, extent=extent, **options)
     if scene.lidar_m is not None:
-        draw_points(ax, scene.lidar_m[:, 1::-1])
+        style.draw_points(ax, scene.lidar_m[:, 1::-1])
     _draw_over(ax, scene, lambda points: points[..., ::-1])
     # The sensor is drawn as a triangle that points ahead.
     ax.plot([0.0], [0.0], "^", color="black", mec="white", ms=8, zorder=7)
@@ -175,7 +150,7 @@ def _draw_polar(ax: Axes, scene: Scene, *, show_labels: bool) -> None:
     """
     horizontal = bin_edges(np.rad2deg(scene.grid.azimuth_rad))
     vertical = bin_edges(scene.grid.range_m)
-    draw_tiles(ax, horizontal, vertical, scene.power)
+    style.draw_tiles(ax, horizontal, vertical, scene.power)
     ax.set_xlim(horizontal.min(), horizontal.max())
     ax.set_ylim(max(vertical[0], 0.0), vertical[-1])
     ax.set(xlabel="azimuth, right positive [deg]", ylabel="range [m]")
@@ -188,7 +163,7 @@ def draw_frame(scene: Scene) -> Figure:
     Returns:
         A figure of 12 by 6.4 inches; write it with `save_figure`.
     """
-    figure = new_figure(12.0, 6.4)
+    figure = style.new_figure(12.0, 6.4)
     bev_ax = figure.add_axes((0.05, 0.085, 0.40, 0.835))
     _draw_ground(scene, ax=bev_ax, label=POWER_LABEL)
     has_image = scene.image is not None
@@ -197,14 +172,8 @@ def draw_frame(scene: Scene) -> Figure:
     _draw_polar(polar_ax, scene, show_labels=not has_image)
     if has_image:
         _draw_view(figure.add_axes((0.53, 0.40, 0.45, 0.52)), scene)
-    figure.legend(
-        handles=_legend_handles(scene),
-        loc="lower center",
-        bbox_to_anchor=(0.765, 0.095 + height),
-        ncols=3,
-        fontsize=8,  # so that counts, threshold and region fit
-        frameon=False,
-    )
+    place = (0.765, 0.095 + height)
+    _add_legend(figure, scene, loc="lower center", bbox_to_anchor=place, ncols=3)
     figure.suptitle(scene.title)
     return figure
 
@@ -214,12 +183,7 @@ def draw_scenes(scenes: Sequence[Scene]) -> Figure:
 
     Args:
         scenes: One or more scenes. The legend is taken from the first one.
-
-    Raises:
-        UserError: There are no scenes.
     """
-    if not scenes:
-        raise UserError("no scenes to draw")
     columns = min(4, len(scenes))
     width = _COLUMN_IN * columns
     has_image = any(scene.image is not None for scene in scenes)
@@ -227,7 +191,7 @@ def draw_scenes(scenes: Sequence[Scene]) -> Figure:
     # The legend is above the color bar if both do not fit next to each other.
     foot_in = _FOOT_IN if columns > 2 else 2 * _FOOT_IN
     height = row_in * -(-len(scenes) // columns) + foot_in
-    figure = new_figure(width, height)
+    figure = style.new_figure(width, height)
     # All scenes share one color scale. The few strongest echoes are beyond its limits.
     values = [scene.power.ravel() for scene in scenes]
     low, high = np.nanpercentile(np.concatenate(values), _SCENE_PERCENTILES)
@@ -249,19 +213,20 @@ def draw_scenes(scenes: Sequence[Scene]) -> Figure:
         (above or below).set_title(scene.title, fontsize=11)
     place = (1 - 3.3 / width, 0.42 / height, 2.7 / width, 0.11 / height)
     bar = figure.colorbar(
-        ScalarMappable(Normalize(*limits), COLOR_MAP),
+        ScalarMappable(Normalize(*limits), style.COLOR_MAP),
         cax=figure.add_axes(place),
         orientation="horizontal",
         extend="both",
     )
     bar.set_label(POWER_LABEL, fontsize=8)
     bar.ax.tick_params(labelsize=8)
-    figure.legend(
-        handles=_legend_handles(scenes[0], show_counts=False),
+    _add_legend(
+        figure,
+        scenes[0],
+        show_counts=False,
         loc="lower left",
         bbox_to_anchor=(0.3 / width, (foot_in - _FOOT_IN + 0.2) / height),
         ncols=3 if columns > 1 else 1,
-        frameon=False,
     )
     return figure
 
@@ -303,7 +268,7 @@ def _axes_for_extent(extent: Extent) -> Axes:
     width, height = scale * (y1 - y0), scale * (x1 - x0)
     total = width + 1.75, height + 1.2
     place = (0.65 / total[0], 0.55 / total[1], width / total[0], height / total[1])
-    return new_figure(*total).add_axes(place)
+    return style.new_figure(*total).add_axes(place)
 
 
 def _draw_over(
@@ -326,26 +291,26 @@ def _draw_over(
         region = np.array([[(x0 + x1) / 2, (y0 + y1) / 2, 0, x1 - x0, y1 - y0, 0, 0]])
         # The dashes have a white outline to be visible on dark and on bright maps.
         ax.plot(
-            *to_axes(footprints(region, 200)[0]).T,
-            color=ROI_COLOR,
+            *to_axes(style.footprints(region, 200)[0]).T,
+            color=style.ROI_COLOR,
             linewidth=1.4,
             linestyle=(0, (5, 3)),
-            path_effects=halo(2.6, "white"),
+            path_effects=style.halo(2.6, "white"),
             zorder=3,
         )
     labels = []
-    for order, (style, boxes) in enumerate(scene.sets):
-        edges = to_axes(footprints(boxes.box, _POINTS_PER_EDGE))
+    for order, (look, boxes) in enumerate(scene.sets):
+        edges = to_axes(style.footprints(boxes.box, _POINTS_PER_EDGE))
         marks = to_axes(_heading_marks(boxes.box))
-        widths = style.width * np.tile(line_scales(ax, edges, 8.0), 2)
-        draw_lines(ax, [*edges, *marks], style.color, widths, 4 + order)
+        widths = look.width * np.tile(style.line_scales(ax, edges, 8.0), 2)
+        style.draw_lines(ax, [*edges, *marks], look.color, widths, 4 + order)
         outlines = np.concatenate([edges, marks], 1)
         labels += [
-            Label(outline, text, style.text_color, style.side)
-            for outline, text in zip(outlines, label_texts(boxes), strict=True)
+            style.Label(outline, text, look.text_color, look.side)
+            for outline, text in zip(outlines, style.label_texts(boxes), strict=True)
         ]
     if show_labels:
-        draw_labels(ax, labels)
+        style.draw_labels(ax, labels)
 
 
 def _heading_marks(boxes: Float[np.ndarray, "N 7"]) -> Float[np.ndarray, "N 2 2"]:
@@ -358,24 +323,29 @@ def _heading_marks(boxes: Float[np.ndarray, "N 7"]) -> Float[np.ndarray, "N 2 2"
     return np.stack([front, front + 0.7 * (front - boxes[:, :2])], 1)
 
 
-def _legend_handles(scene: Scene, *, show_counts: bool = True) -> list[Line2D]:
-    """Return one legend handle per kind of line."""
+def _add_legend(
+    owner: Axes | Figure, scene: Scene, *, show_counts: bool = True, **place: Any
+) -> None:
+    """Add a legend with one handle per kind of line to axes or a figure."""
     handles = []
-    for style, boxes in scene.sets:
-        label = f"{style.name} ({len(boxes)})" if show_counts else style.name
+    for look, boxes in scene.sets:
+        label = f"{look.name} ({len(boxes)})" if show_counts else look.name
         if boxes.score is not None and scene.score_threshold is not None:
             label += f", score ≥ {scene.score_threshold:g}"
-        line = Line2D([], [], color=style.color, lw=style.width, label=label)
-        line.set_path_effects(halo(style.width + 1.4))
+        line = Line2D([], [], color=look.color, lw=look.width, label=label)
+        line.set_path_effects(style.halo(look.width + 1.4))
         handles.append(line)
     if scene.lidar_m is not None:
-        color = LIDAR_COLOR
+        color = style.LIDAR_COLOR
         handles.append(Line2D([], [], marker=".", ls="", color=color, label="LiDAR"))
     if scene.roi is not None:
         named = [name for name, roi in ROIS.items() if roi == tuple(scene.roi)]
         label = f"{named[0]} region" if named else "region of interest"
-        handles.append(Line2D([], [], color=ROI_COLOR, lw=1.4, ls="--", label=label))
-    return handles
+        handles.append(
+            Line2D([], [], color=style.ROI_COLOR, lw=1.4, ls="--", label=label)
+        )
+    # Counts, threshold and region fit in this font size.
+    owner.legend(handles=handles, fontsize=8, frameon=False, **place)
 
 
 # Slices -------------------------------------------------------------------------------
@@ -416,19 +386,21 @@ def draw_slices(scene: Scene, *, range_idx: int | None = None) -> Figure:
     outlines = _outlines(np.zeros((0, 7)) if truth is None else truth.box)
     panels = list(zip(axes_of, planes, outlines, strict=True))
     panels = [panel for panel in panels if panel[1].size]
-    figure = new_figure(14.0, 4.2, layout="constrained")
+    figure = style.new_figure(14.0, 4.2, layout="constrained")
     axes = figure.subplots(1, len(panels))
-    limits = color_limits_of(values)
+    limits = style.color_limits_of(values)
     for ax, (title, plane, lines) in zip(axes, panels, strict=True):
         (x, x_label), (y, y_label) = axes_of[title]
-        mesh = draw_tiles(ax, bin_edges(x), bin_edges(y), plane, limits)
+        mesh = style.draw_tiles(ax, bin_edges(x), bin_edges(y), plane, limits)
         ax.set(xlabel=x_label, ylabel=y_label, title=title)
         figure.colorbar(mesh, ax=ax, label="normalized log power")
         if x is grid.doppler_mps:
             left, right = ax.get_xlim()
             lines = [np.add(bar, [left + 0.02 * (right - left), 0.0]) for bar in lines]
         # Lines are thinner here, as most boxes only cover a few bins.
-        draw_lines(ax, lines, GROUND_TRUTH.color, 0.7 * GROUND_TRUTH.width)
+        style.draw_lines(
+            ax, lines, style.GROUND_TRUTH.color, 0.7 * style.GROUND_TRUTH.width
+        )
     figure.suptitle(scene.title)
     return figure
 
@@ -437,7 +409,7 @@ def _outlines(
     boxes: Float[np.ndarray, "N 7"],
 ) -> tuple[list[Float[np.ndarray, "_ 2"]], ...]:
     """Return the lines of boxes in the three slices, with bars at a Doppler of 0."""
-    azimuth_range = [to_polar(outline) for outline in footprints(boxes, 8)]
+    azimuth_range = [to_polar(outline) for outline in style.footprints(boxes, 8)]
     bars, azimuth_elevation = [], []
     for outline, points in zip(azimuth_range, corners(boxes), strict=True):
         ground = to_polar(points[:, :2])

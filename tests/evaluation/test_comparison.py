@@ -16,8 +16,9 @@ from radejax.evaluation.files import Source, evaluate_files
 from radejax.evaluation.report import write_report
 from radejax.evaluation.results import (
     EvaluationOptions,
-    evaluate_tables,
+    compute_results,
     interval,
+    make_set,
     resample,
     sequence_weights,
 )
@@ -228,7 +229,8 @@ def test_one_class_has_no_second_row_for_its_mean(scene):
 def test_rows_by_weather_and_distance_agree_with_the_report(scene):
     truth, found, frames = scene
     options = settings(protocols=("all_point", "kradar_r40"), score_threshold=0.4)
-    data, results = evaluate_tables(truth, found, frames, options)
+    data = make_set(truth, found, frames, options)
+    results = compute_results(data, frames, options)
     rows = compare({"": data}, {"": data}, frames, options)
     assert {row.score_threshold for row in rows if row.protocol == "all_point"} == {0.0}
     aps = {row.key: row for row in results}

@@ -27,39 +27,27 @@ def scene(random_scene):
 
 @pytest.fixture(scope="module")
 def written(scene, tmp_path_factory):
-    """Report of all protocols, its folder, and the frames that were drawn."""
-    out, drawn = tmp_path_factory.mktemp("report"), {}
-
-    def draw(frame, path):
-        drawn[frame] = path.name
-        path.write_text("figure")
-
+    """Report of all protocols, and its folder."""
+    out = tmp_path_factory.mktemp("report")
     options = EvaluationOptions(
         roi=None, plots=False, bootstrap=20, label_version="v2.1"
     )
-    made = report.write_report(*scene, out, options, run="mine", draw_frame=draw)
-    return made, out, drawn
+    return report.write_report(*scene, out, options, run="mine"), out
 
 
 def test_report_folder_has_all_files_and_no_temporary_ones(written):
-    made, out, drawn = written
+    made, out = written
     names = {p.name for p in out.iterdir()}
     assert names == {
         "metrics.json", "metrics.csv", "report.txt", "tables.md", "tables.tex", "tables",
-        "predictions.npz", "ground_truth.npz", "frames.json", "worst_frames",
+        "predictions.npz", "ground_truth.npz", "frames.json",
     }  # fmt: skip
     assert made.folder == out
     assert (out / "report.txt").read_text() == made.text
-    assert [w["frame"] for w in made.metrics["worst_frames"]] == list(drawn)
-    # Figures are named as other figures of frames are.
-    assert {p.name for p in (out / "worst_frames").iterdir()} == {
-        f"{frame // 3:02d}_{frame:05d}_{frame:05d}.png" for frame in drawn
-    }
-    assert set(drawn.values()) == {p.name for p in (out / "worst_frames").iterdir()}
 
 
 def test_json_and_csv_hold_the_numbers_of_evaluate(written, scene):
-    made, out, _ = written
+    made, out = written
     metrics = json.loads(
         (out / "metrics.json").read_text(), parse_constant=lambda name: 1 / 0
     )
@@ -103,7 +91,7 @@ def test_means_are_over_classes_that_occur(written):
 
 
 def test_tables_include_the_published_rows(written):
-    _, out, _ = written
+    _, out = written
     text = (out / "tables.md").read_text()
     for cell in ("85.4", "77.42", "64.06", "RADE-Net, Table II", "DinoRADE, Table 1"):
         assert cell in text
@@ -143,15 +131,9 @@ def test_invalid_sizes_are_rejected_or_kept_as_false_positives(scene, tmp_path):
     assert made.results[0].num_det == whole[0].num_det
 
 
-def test_an_evaluation_that_fails_leaves_the_old_results(scene, tmp_path):
+def test_an_evaluation_that_fails_leaves_the_old_results(scene, tmp_path, monkeypatch):
     out = tmp_path / "out"
-    few = {name: column[:3] for name, column in scene[2].items()}
-    in_few = [{k: v[t["frame"] < 3] for k, v in t.items()} for t in scene[:2]]
-
-    def draw(frame, path):
-        path.write_text(f"first, {frame}")
-
-    report.write_report(*scene, out, OPTIONS, draw_frame=draw)
+    report.write_report(*scene, out, OPTIONS)
     (out / "notes.txt").write_text("mine")
 
     def content():
@@ -159,16 +141,17 @@ def test_an_evaluation_that_fails_leaves_the_old_results(scene, tmp_path):
 
     before = content()
 
-    def fill(frame, path):
+    def fill(path, *_):
         path.write_text("half")
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
-    with pytest.raises(DiskFullError, match="no space left on the disk of"):
-        report.write_report(*scene, out, OPTIONS, draw_frame=fill, run="second")
+    with monkeypatch.context() as patched:
+        patched.setattr(report, "write_boxes", fill)
+        with pytest.raises(DiskFullError, match="no space left on the disk of"):
+            report.write_report(*scene, out, OPTIONS, run="second")
     assert content() == before
-    report.write_report(*in_few, few, out, OPTIONS, draw_frame=draw)
+    report.write_report(*scene, out, OPTIONS, run="third")
     assert (out / "notes.txt") in content()
-    assert len(list((out / "worst_frames").iterdir())) <= 3  # only of this evaluation
 
 
 def test_frame_table_may_have_only_ids(scene, tmp_path):

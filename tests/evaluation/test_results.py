@@ -8,10 +8,11 @@ from radejax.evaluation.boxes import take
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.results import (
     EvaluationOptions,
+    compute_results,
     condition_masks,
-    evaluate_tables,
     exclusion_counts,
     interval,
+    make_set,
     resample,
     sequence_weights,
 )
@@ -69,7 +70,8 @@ def test_weights_of_a_condition_give_the_condition(scene, data):
 
 def intervals(scene, frames, **changes):
     options = dataclasses.replace(OPTIONS, **changes)
-    _, results = evaluate_tables(*scene[:2], frames, options)
+    data = make_set(*scene[:2], frames, options)
+    results = compute_results(data, frames, options)
     return {r.key[1:4]: (r.low, r.ap, r.high) for r in results}
 
 

@@ -13,7 +13,7 @@ from radejax.evaluation.boxes import tables_from_frames
 from radejax.evaluation.comparison import compare_files
 from radejax.evaluation.files import Source, evaluate_files
 from radejax.evaluation.report import PUBLISHED
-from radejax.evaluation.results import EvaluationOptions, evaluate_tables
+from radejax.evaluation.results import EvaluationOptions, compute_results, make_set
 from radejax.runs import checks
 
 
@@ -220,7 +220,7 @@ def real(shared):
 def _tables(real, split="test", **changes):
     """Rows of Tables I, II, DinoRADE's 3, III and of other methods."""
     options = dataclasses.replace(AS_PAPERS, **changes)
-    _, results = evaluate_tables(*real, options)
+    results = compute_results(make_set(*real, options), real[2], options)
     by_key = {row.key: row for row in results}
     built = report.paper_tables("mine", by_key, options, split)
     return [table.rows for table in built]

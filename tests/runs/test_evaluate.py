@@ -190,7 +190,6 @@ def test_titles_of_scenes_say_whether_they_are_simulated(
     frames = Frames([SimpleNamespace(key="1/00033_00001", weather="fog", boxes=[])])
     frames.is_simulated = is_simulated
     titles: list[str] = []
-    (tmp_path / "figures").mkdir()
     monkeypatch.setattr(evaluate, "draw_scenes", titles.extend)
     saved: list[str] = []
     monkeypatch.setattr(
@@ -199,9 +198,11 @@ def test_titles_of_scenes_say_whether_they_are_simulated(
     evaluation: Any = SimpleNamespace(
         _frames=frames,
         _options=SimpleNamespace(num_visualizations=1, figures="pdf"),
-        _figures=lambda *_: [],
+        _spread=lambda count: [0] * count,
+        _figures=lambda _, indices: [(f"frame_{index}", None) for index in indices],
         _scene=lambda _, __, title: title,
     )
-    evaluate.Evaluation._write_figures(evaluation, {}, tmp_path, tmp_path)
-    assert saved == ["scenes.pdf"]
+    evaluate.Evaluation._write_figures(evaluation, {}, tmp_path, tmp_path, [7])
+    assert saved == ["frame_0.pdf", "frame_7.pdf", "scenes.pdf"]
+    assert (tmp_path / "worst_frames").is_dir()  # also without mistakes
     assert titles == [f"fog (1/00033_00001){', simulated' if is_simulated else ''}"]

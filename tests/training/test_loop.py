@@ -34,7 +34,8 @@ def compiled_once() -> Iterator[None]:
     Runs differ in what happens around their steps, and tracing takes the longest.
     """
     fields = ("learning_rate", "final_learning_rate", "warmup_steps", "num_epochs")
-    fields = (*fields, "max_steps")
+    fields = (*fields, "max_steps", "weight_decay", "gradient_clip_norm")
+    fields = (*fields, "gradient_accumulation_steps")
 
     def key(x: Any) -> Any:
         if isinstance(x, ConfigDict):

@@ -242,7 +242,7 @@ def test_two_steps_of_every_config(name: str, words: str) -> None:
     )
     batch = jax.device_put(_batch(config, grid))
     model = models.build(config.model)
-    optimizer = make_optimizer(lambda _: 1e-3, weight_decay=config.train.weight_decay)
+    optimizer = make_optimizer(config.train, lambda _: 1e-3)
     inputs = [batch.projection]
     inputs += [] if batch.image is None else [batch.image, batch.camera]
     start = create_state(

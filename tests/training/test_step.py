@@ -32,7 +32,7 @@ Tiny = Any  # the fixture `tiny` of conftest.py
 @pytest.fixture(scope="module")
 def start(tiny: Tiny) -> tuple[Any, Any]:
     """Optimizer and initial state."""
-    optimizer = make_optimizer(lambda _: 3e-3, weight_decay=0.01)
+    optimizer = make_optimizer(tiny.config.train, lambda _: 3e-3)
     state = create_state(tiny.variables, optimizer, use_ema=True)
     return optimizer, jax.tree.map(jnp.asarray, state)
 

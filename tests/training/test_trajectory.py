@@ -69,7 +69,7 @@ def train(
     config.train.batch_size = 2
     config.train.num_epochs = -(-num_steps // STEPS_PER_EPOCH)
     schedule = make_schedule(config.train, STEPS_PER_EPOCH)
-    optimizer = make_optimizer(schedule, weight_decay=config.train.weight_decay)
+    optimizer = make_optimizer(config.train, schedule)
     grid = models.map_grid(RadarGrid.kradar(), model, config.data.azimuth_mapping)
     mesh = distributed.make_mesh(1)
     state = create_state(

@@ -197,8 +197,3 @@ def test_one_strong_echo_does_not_darken_the_maps() -> None:
     figure = draw_scenes([scene])
     (mesh,) = figure.axes[0].findobj(QuadMesh)
     assert mesh.get_clim()[1] < 0.5
-
-
-def test_no_scenes() -> None:
-    with pytest.raises(UserError, match="no scenes"):
-        draw_scenes([])
