@@ -34,8 +34,9 @@ import jax.numpy as jnp
 from radejax import models
 from radejax.core.config import load_config
 from radejax.core.structures import Batch
+from radejax.data.cameras import no_images
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.inference.detector import detect, placeholder
+from radejax.inference.detector import detect
 from radejax.models.layers import GroupNorm
 from radejax.simulation.radar import tensor
 from radejax.training.step import create_state, make_optimizer, make_train_step
@@ -68,7 +69,7 @@ def batch_of(model, grid, size, max_objects=16):
     rows = size, max_objects
     image = camera = None
     if models.has_camera(model):
-        image, camera = jax.eval_shape(lambda: placeholder(size, model))
+        image, camera = jax.eval_shape(lambda: no_images(size, model.image_size))
     return Batch(
         projection=shape_of(size, *grid.projection_shape, dtype=jnp.float16),
         boxes=shape_of(*rows, 8),

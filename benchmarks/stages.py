@@ -21,10 +21,11 @@ from tabulate import tabulate
 from radejax import models
 from radejax.cli.entry import set_up_jax
 from radejax.core.config import load_config
+from radejax.data.cameras import no_images
 from radejax.data.projection import project_jax
 from radejax.detection.decode import decode
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.inference.detector import Detector, placeholder
+from radejax.inference.detector import Detector
 from radejax.inference.saved import SavedModel
 from radejax.simulation.config import SimulationConfig
 
@@ -45,7 +46,7 @@ def untrained(config: ConfigDict, **overrides: Any) -> Detector:
     model = models.build(config["model"])
     inputs: tuple[Any, ...] = (np.zeros((1, *grid.projection_shape), np.float32),)
     if models.has_camera(model):
-        inputs += placeholder(1, model)
+        inputs += no_images(1, model.image_size)
     # Only shapes are computed, as compiling the initialization takes longer than measuring.
     shapes = jax.eval_shape(model.init, jax.random.key(0), *inputs)
     rng = np.random.default_rng(0)
@@ -99,7 +100,7 @@ def _measure(
     frames *= 1e9 if tesseract else 0.3
     extra: tuple[Any, ...] = ()
     if detector.takes_camera:
-        image, camera = placeholder(batch, detector.model)
+        image, camera = no_images(batch, detector.model.image_size)
         extra = image, camera.replace(is_valid=np.ones(batch, bool))
     sized = detector.replace(batch_sizes=(batch,))  # no padding to another size
 

@@ -13,8 +13,8 @@ import pathlib
 
 from ml_collections import ConfigDict
 
-from radejax.core.config import load_module, parse_options
-from radejax.simulation.config import FULL_SIZE, plain
+from radejax.core.config import load_module, parse_options, plain
+from radejax.simulation.config import FULL_SIZE
 
 
 def get_config(arg: str | None = None) -> ConfigDict:

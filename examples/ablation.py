@@ -50,7 +50,7 @@ from ml_collections import ConfigDict
 
 from radejax.cli import entry
 from radejax.core import files
-from radejax.core.config import load_config
+from radejax.core.config import load_config, plain
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
 from radejax.data.kradar.dataset import read_split
@@ -67,7 +67,6 @@ from radejax.evaluation.results import (
 )
 from radejax.runs import experiment
 from radejax.runs.evaluate import evaluate_run
-from radejax.simulation.config import plain
 from radejax.simulation.dataset import simulate_dataset
 
 HELD_OUT_SEED = 1_000_003

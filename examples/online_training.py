@@ -22,12 +22,11 @@ from online_batches import OnlineBatches
 
 from radejax import models
 from radejax.cli import entry
-from radejax.core.config import load_config
+from radejax.core.config import load_config, plain
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
 from radejax.runs import checks
 from radejax.runs.experiment import checkpoint_info, claimed
-from radejax.simulation.config import plain
 from radejax.training import distributed, loop
 from radejax.training.step import TrainState
 

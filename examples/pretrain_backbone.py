@@ -34,14 +34,14 @@ from ml_collections import ConfigDict
 from radejax import models
 from radejax.cli import entry
 from radejax.core import files
-from radejax.core.config import load_config
+from radejax.core.config import load_config, plain
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
 from radejax.models.image import STRIDE, ResNetTrunk, normalize
 from radejax.models.vit import ViT
 from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibration
 from radejax.simulation.camera.shapes import camera_position
-from radejax.simulation.config import SimulationConfig, plain
+from radejax.simulation.config import SimulationConfig
 from radejax.simulation.simulator import make_source
 from radejax.simulation.world.scene import Sequence
 from radejax.simulation.world.traffic import SIZES

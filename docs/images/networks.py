@@ -23,8 +23,8 @@ from sheet import Block, Point, Sheet
 
 from radejax import models
 from radejax.core.config import load_config
+from radejax.data.cameras import no_images
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.inference.detector import placeholder
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 DATA, RADAR, ATTENTION, CAMERA, HEADS = (
@@ -64,7 +64,7 @@ class Network:
         model = models.build(config.model)
         inputs: tuple[Any, ...] = (np.zeros((1, *grid.projection_shape), np.float32),)
         if models.has_camera(model):
-            inputs += placeholder(1, model)
+            inputs += no_images(1, model.image_size)
         kinds: dict[str, str] = {}
 
         def run(*inputs: Any) -> Any:

@@ -166,6 +166,15 @@ def without_data_paths(config: ConfigDict) -> dict[str, Any]:
     return {**values, "data": {**values["data"], **empty}}
 
 
+def plain(config: Any) -> Any:
+    """Converts mappings to dictionaries and lists to tuples, recursively."""
+    if isinstance(config, list | tuple):
+        return tuple(map(plain, config))
+    if isinstance(config, Mapping | ConfigDict):
+        return {name: plain(value) for name, value in config.items()}
+    return config
+
+
 _FIELDS: dict[str, Any] = {
     # Seed of the initial parameters, the order of the data, dropout and augmentation.
     "seed": 0,

@@ -12,27 +12,22 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import UInt8
 
+from radejax.core import errors
 from radejax.core.archives import wrap_read_errors
-from radejax.core.errors import (
-    DataError,
-    Range,
-    check_options,
-    one_of,
-    or_none,
-    several,
-)
+from radejax.core.errors import DataError, one_of, or_none
 from radejax.geometry.camera import (
     LOOKING_AHEAD,
     Camera,
     CameraCalibration,
     ImageKind,
+    stack_cameras,
 )
 
-_FINITE: Range = math.isfinite, "a finite number"
+_FINITE: errors.Range = math.isfinite, "a finite number"
 _OPTIONS = {
     "projection": one_of("raw", "pinhole"),
     "calibration": one_of("sequence", "common"),
-    "radar_from_lidar_m": or_none(several(_FINITE, "three finite numbers", 3)),
+    "radar_from_lidar_m": or_none(errors.several(_FINITE, "three finite numbers", 3)),
     "radar_from_lidar_z_m": or_none(_FINITE),
 }
 
@@ -120,7 +115,7 @@ class CameraOptions:
     allow_missing: bool = True
 
     def __post_init__(self) -> None:
-        check_options(vars(self), "config.data.camera", _OPTIONS)
+        errors.check_options(vars(self), "config.data.camera", _OPTIONS)
 
     @classmethod
     def from_config(cls, data: Mapping[str, Any]) -> CameraOptions:
@@ -155,3 +150,11 @@ def no_camera(image_size: tuple[int, int]) -> Camera:
         height=height,
     )
     return calibration.camera("raw", is_valid=False)
+
+
+def no_images(
+    count: int, image_size: tuple[int, int]
+) -> tuple[UInt8[np.ndarray, "{count} H W 3"], Camera]:
+    """Returns black images and a batch of invalid cameras in the shapes of real ones."""
+    image = np.zeros((count, *image_size, 3), np.uint8)
+    return image, stack_cameras([no_camera(image_size)] * count)

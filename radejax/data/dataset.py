@@ -167,15 +167,10 @@ class LabelledFrames(Sequence[_F]):
     release: str | None = None
 
     def __init__(
-        self,
-        frames: Sequence[_F],
-        grid: RadarGrid,
-        summary: Summary | None = None,
-        *,
-        is_simulated: bool = False,
+        self, frames: Sequence[_F], grid: RadarGrid, *, is_simulated: bool = False
     ) -> None:
         self.grid, self.is_simulated = grid, is_simulated
-        self._frames, self._summary = frames, summary or Summary()
+        self._frames, self._summary = frames, Summary()
 
     def __len__(self) -> int:
         return len(self._frames)

@@ -129,18 +129,15 @@ def camera_inputs(
             known[source] = _camera(frame, shift, image_size, options)
         cameras.append(known[source][0])
         sizes.append(known[source][1])
+    count = f"{len(missing)} of {len(frames)} frames"
     if missing and not options.allow_missing:
         raise UserError(
-            f"{len(missing)} of {len(frames)} frames have no front image or no camera "
-            f"calibration, the first is {missing[0]}; "
-            "config.data.camera.allow_missing=True uses only the radar there"
+            f"{count} have no front image or no camera calibration, the first is "
+            f"{missing[0]}; config.data.camera.allow_missing=True uses only the radar there"
         )
     if missing:
-        _log.warning(
-            "%d of %d frames have no front image or no camera calibration: radar only",
-            len(missing),
-            len(frames),
-        )
+        what = "no front image or no camera calibration"
+        _log.warning("%s have %s: radar only", count, what)
     return CameraInputs(tuple(cameras), image_size, options, features, sources, sizes)
 
 
@@ -241,12 +238,9 @@ def sample_keys(
         return tuple((frame.key,) for frame in frames)
     histories = frame_histories(records.keys(), num_frames)
     keys = tuple(histories[frame.key] for frame in frames)
-    _log.info(
-        "%d of %d samples of %d frames repeat one, as a preceding frame is missing",
-        sum(len(set(sample)) < num_frames for sample in keys),
-        len(keys),
-        num_frames,
-    )
+    text = "%d of %d samples of %d frames repeat one, as a preceding frame is missing"
+    num_repeating = sum(len(set(sample)) < num_frames for sample in keys)
+    _log.info(text, num_repeating, len(keys), num_frames)
     return keys
 
 

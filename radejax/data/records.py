@@ -74,15 +74,12 @@ class Records:
                 "preprocess` or `radejax embed` wrote"
             )
         content = files.read_json(path)
-        try:
+        what = "a description of records: delete the folder and write it again"
+        with wrap_read_errors(path, what):
             shape, dtype = tuple(map(int, content["shape"])), content["dtype"]
             if dtype not in ENCODINGS:
                 raise ValueError(f"dtype is {dtype!r:.80}")
             return cls(path.parent, shape, dtype, dict(content["source"]))
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise DataError(
-                f"{path}: corrupted ({error!r:.200}); delete the folder and write it again"
-            ) from None
 
     @classmethod
     def create(
@@ -118,9 +115,8 @@ class Records:
         except UserError:
             if files.find_files(path.parent, "*.npy"):
                 raise
-            files.write_json(
-                path, wanted
-            )  # of a call that failed before its first record
+            # They are of a call that failed before its first record.
+            files.write_json(path, wanted)
         return cls.open(folder)
 
     @functools.cached_property
@@ -130,15 +126,11 @@ class Records:
         Raises:
             DataError: The records are not projections, or `records.json` is corrupted.
         """
-        try:
+        with wrap_read_errors(self.folder / _DESCRIPTION, "the records of a radar"):
             grid = RadarGrid.from_dict(self.source["grid"])
             if grid.projection_shape != self.shape:
                 raise ValueError(f"arrays of shape {self.shape}")
             return grid
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
-            raise DataError(
-                f"{self.folder / _DESCRIPTION}: not the records of a radar ({error!r:.200})"
-            ) from None
 
     def keys(self) -> set[str]:
         """Lists the folder and returns the keys of all frames that have a record."""

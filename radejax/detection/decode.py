@@ -288,9 +288,7 @@ def _max_3x3(values: Float[jax.Array, "B R A C"]) -> Float[jax.Array, "B R A C"]
 
 
 def _in_roi(
-    params: Float[jax.Array, "B R A 8"],
-    grid: RadarGrid,
-    roi: Roi,
+    params: Float[jax.Array, "B R A 8"], grid: RadarGrid, roi: Roi
 ) -> Bool[jax.Array, "B R A"]:
     """Returns True for bins whose box has its center in the region."""
     roi = jnp.asarray(roi, jnp.float32)

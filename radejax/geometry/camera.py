@@ -28,6 +28,8 @@ from radejax.core.files import as_path
 from radejax.geometry.boxes import array_module, corners
 from radejax.geometry.radar_grid import ArrayValues
 
+Pixels = Real[np.ndarray, "*points 2"]
+Depths = Real[np.ndarray, "*points"]
 ImageKind = Literal["raw", "pinhole"]
 """The recorded image with lens distortion, or a pinhole image with the same intrinsics."""
 
@@ -371,18 +373,14 @@ class CameraCalibration(ArrayValues):
 
     def project_ego(
         self, points_ego: Real[np.ndarray, "*points 3"], image: ImageKind = "raw"
-    ) -> tuple[Float[np.ndarray, "*points 2"], Float[np.ndarray, "*points"]]:
+    ) -> tuple[Pixels, Depths]:
         """Projects ego-frame points `[..., 3]` to pixels `[..., 2]` and depth `[...]` in meters.
 
         Pixels are meaningless where the depth is not positive; see `in_image`.
         """
         return project(np.asarray(points_ego, np.float64), self.camera(image))
 
-    def in_image(
-        self,
-        pixels: Real[np.ndarray, "*points 2"],
-        depth_m: Real[np.ndarray, "*points"],
-    ) -> Bool[Any, "*points"]:
+    def in_image(self, pixels: Pixels, depth_m: Depths) -> Bool[Any, "*points"]:
         """Returns True where projected points lie in front of the camera and in the image."""
         inside = (pixels >= 0) & (pixels < np.array([self.width, self.height]))
         return inside.all(-1) & (depth_m > 0)

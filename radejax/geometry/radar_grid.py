@@ -377,9 +377,7 @@ class RadarGrid(ArrayValues):
         )
 
     def boxes_at(
-        self,
-        params: Float[jax.Array, "*bins 8"],
-        bins: Int[jax.Array, "*bins 2"],
+        self, params: Float[jax.Array, "*bins 8"], bins: Int[jax.Array, "*bins 2"]
     ) -> Float[jax.Array, "*bins 8"]:
         """Returns the boxes that a detector's maps describe at the given bins.
 
@@ -418,16 +416,13 @@ class RadarGrid(ArrayValues):
             >>> RadarGrid.kradar().check_maps(*maps)
         """
         logits, params = heatmap.shape, box_params.shape
-        expected = (self.num_range, self.num_azimuth)
-        if len(logits) != 4 or params != (*logits[:3], 8):
+        bins = (self.num_range, self.num_azimuth)
+        is_maps = len(logits) == 4 and params == (*logits[:3], 8)
+        if not is_maps or logits[1:3] != bins:
             raise ValueError(
-                f"maps must be [B, R, A, C] and [B, R, A, 8], got {logits} and {params}"
-            )
-        if logits[1:3] != expected:
-            raise ValueError(
-                f"maps have {logits[1]} x {logits[2]} range x azimuth bins, the grid "
-                f"{expected[0]} x {expected[1]}: pass the grid of the maps "
-                "(grid.padded(...) where the model pads and does not crop)"
+                f"maps have shapes {logits} and {params}, expected [B, R, A, C] and "
+                f"[B, R, A, 8] on the grid's {bins[0]} x {bins[1]} bins (range, azimuth): "
+                "pass the grid of the maps, padded if the model pads and does not crop"
             )
 
     def in_field_of_view(self, x_m: Positions, y_m: Positions) -> Bool[Any, "*bins"]:

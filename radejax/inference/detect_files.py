@@ -11,7 +11,6 @@ import dataclasses
 import importlib.util
 import itertools
 import json
-import os
 import pathlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -21,6 +20,7 @@ import tqdm
 
 from radejax.core import files
 from radejax.core.errors import UserError
+from radejax.core.files import PathLike
 from radejax.core.structures import BOX_FIELDS, Detections, frame_key
 from radejax.data.dataset import FrameSequence, data_set
 from radejax.data.kradar import KRadar
@@ -38,7 +38,7 @@ PATTERNS = ("tesseract_*.mat", "DERA_tesseract_*.npy", "polar3d_*.npy", "rpc_*.n
 
 
 def find_frames(
-    paths: Sequence[str | os.PathLike],
+    paths: Sequence[PathLike],
     sequence_numbers: Sequence[int] | None = None,
     weather: Sequence[str] | None = None,
 ) -> list[pathlib.Path]:
@@ -95,10 +95,9 @@ def sequence_folder(path: pathlib.Path) -> pathlib.Path:
 def front_images(
     paths: Sequence[pathlib.Path],
     detector: Detector,
-    labels: str | os.PathLike | None = None,
-    version: str = "v2.1",
-    camera_calibration: str | os.PathLike | None = None,
-    roots: Sequence[str | os.PathLike] = (),
+    labels: PathLike | None = None,
+    camera_calibration: PathLike | None = None,
+    roots: Sequence[PathLike] = (),
 ) -> dict[pathlib.Path, tuple[pathlib.Path, Camera]]:
     """Find the images and cameras of frames.
 
@@ -107,7 +106,6 @@ def front_images(
         detector: Detector of a radar-camera model.
         labels: Label revision, see `KRadar`. If None, the label files of the sequences
             are used, and sequences without them have no images.
-        version: Version of the labels.
         camera_calibration: Folder of camera calibrations; None for those in the roots.
         roots: Files and folders in which `find_frames` searched. Folders of sequences
             without radar files may have their images and labels.
@@ -135,7 +133,7 @@ def front_images(
     frames = KRadar(
         sorted({folder.parent for folder in sequences}) + sorted(others),
         labels,
-        version=version,
+        version=detector.saved.config.data.label_version,
         visibility=None,
         field_of_view=False,
         sequence_numbers={int(folder.name) for folder in sequences},
@@ -165,18 +163,18 @@ def _cameras(frames: FrameSequence, detector: Detector) -> Sequence[Camera]:
 
 
 def detect_files(
-    source: str | os.PathLike,
-    paths: Sequence[str | os.PathLike],
-    out: str | os.PathLike,
+    source: PathLike,
+    paths: Sequence[PathLike],
+    out: PathLike,
     *,
     step: Step = None,
     batch_size: int = 8,
     file_format: str = "json",
     sequence_numbers: Sequence[int] | None = None,
     weather: Sequence[str] | None = None,
-    labels: str | os.PathLike | None = None,
-    camera_calibration: str | os.PathLike | None = None,
-    image_backbone: str | os.PathLike | None = None,
+    labels: PathLike | None = None,
+    camera_calibration: PathLike | None = None,
+    image_backbone: PathLike | None = None,
     **settings: Any,
 ) -> dict[str, int]:
     """Detect the objects in every frame, and write one file per frame atomically.
@@ -219,12 +217,15 @@ def detect_files(
             f"format parquet needs {' and '.join(lacking)}: pip install {' '.join(lacking)}"
         )
     detector = Detector.from_workdir(source, step, image_backbone=image_backbone)
-    is_kradar = detector.saved.config.data.format == "kradar"
-    read, part = _files if is_kradar else _frames, (sequence_numbers, weather)
-    data = detector.saved.config.data
-    labels = labels or data.labels
-    calibration = camera_calibration or data.camera_calibration
-    keys, inputs = read(paths, *part, detector, labels, calibration)
+    data, part = detector.saved.config.data, (sequence_numbers, weather)
+    read = _files if data.format == "kradar" else _frames
+    own = labels or data.labels, camera_calibration or data.camera_calibration
+    keys, radar, images = read(paths, *part, detector, *own)
+
+    def inputs(batch: slice) -> Any:
+        of_batch = radar(batch)
+        return (of_batch, *zip(*images[batch], strict=True)) if images else of_batch
+
     out = files.as_path(out)
     out.mkdir(parents=True, exist_ok=True)
     names = [f"{key.replace('/', '_')}.json" for key in keys]
@@ -275,15 +276,21 @@ def _batches(
     ]
 
 
+Inputs = tuple[list[str], Callable[[slice], Any], list[Any]]
+"""Keys of frames, a function that reads a batch of radar data, and images with cameras.
+
+The latter are empty if no frame has any."""
+
+
 def _files(
-    paths: Sequence[str | os.PathLike],
+    paths: Sequence[PathLike],
     sequence_numbers: Sequence[int] | None,
     weather: Sequence[str] | None,
     detector: Detector,
-    labels: str | os.PathLike | None,
-    camera_calibration: str | os.PathLike | None,
-) -> tuple[list[str], Callable[[slice], Any]]:
-    """Return the keys of K-Radar's frames, and a function that reads a batch of inputs."""
+    labels: PathLike | None,
+    camera_calibration: PathLike | None,
+) -> Inputs:
+    """Find the frames in K-Radar's files."""
     frames = find_frames(paths, sequence_numbers, weather)
     seen: dict[str, pathlib.Path] = {}
     for path in frames:
@@ -295,26 +302,22 @@ def _files(
     if detector.num_frames > 1:  # folders of tensors and of projections may be mixed
         frames.sort(key=key_of)
     keys = [key_of(path) for path in frames]
-    version = detector.saved.config.data.label_version
-    known: dict[pathlib.Path, tuple[pathlib.Path, Camera]] = {}
+    images: list[Any] = []
     if detector.takes_camera:
-        own = camera_calibration
-        known = front_images(frames, detector, labels, version, own, paths)
-    if not known:
-        return keys, lambda batch: frames[batch]
-    images = [known.get(path.absolute(), (None, None)) for path in frames]
-    return keys, lambda batch: (frames[batch], *zip(*images[batch], strict=True))
+        known = front_images(frames, detector, labels, camera_calibration, paths)
+        images = [known.get(path.absolute(), (None, None)) for path in frames if known]
+    return keys, frames.__getitem__, images
 
 
 def _frames(
-    roots: Sequence[str | os.PathLike],
+    roots: Sequence[PathLike],
     sequence_numbers: Sequence[int] | None,
     weather: Sequence[str] | None,
     detector: Detector,
-    labels: str | os.PathLike | None,
-    camera_calibration: str | os.PathLike | None,
-) -> tuple[list[str], Callable[[slice], Any]]:
-    """Return the same as `_files` from the reader of the run's own format."""
+    labels: PathLike | None,
+    camera_calibration: PathLike | None,
+) -> Inputs:
+    """Find the frames by the reader of the run's own format."""
     config = detector.saved.config
     frames = data_set(config.data.format)(
         list(map(str, roots)),
@@ -337,10 +340,9 @@ def _frames(
         ]
 
     def read(batch: slice) -> Any:
-        radar = np.stack([f.read_projection(frames.grid) for f in frames[batch]])
-        return (radar, *zip(*images[batch], strict=True)) if images else radar
+        return np.stack([f.read_projection(frames.grid) for f in frames[batch]])
 
-    return [frame.key for frame in frames], read
+    return [frame.key for frame in frames], read, images
 
 
 def _texts(keys: Sequence[str], detections: Detections, file_format: str) -> list[str]:

@@ -25,7 +25,7 @@ from radejax.core.errors import UserError, require
 from radejax.core.files import PathLike, as_path
 from radejax.core.memory import cache_compiled_programs
 from radejax.core.structures import ROIS, Array, Batch, Detections, to_float
-from radejax.data.cameras import CameraOptions, no_camera, read_left_image
+from radejax.data.cameras import CameraOptions, no_camera, no_images, read_left_image
 from radejax.data.projection import (
     MAX_LEVEL,
     find_problem,
@@ -59,7 +59,6 @@ Calibration = CameraCalibration | PathLike
 Calibrations = Camera | Calibration | Sequence[Camera | Calibration | None]
 
 _PATH = (str, os.PathLike)
-_project = jax.jit(project_jax)
 _KRADAR_FROM_LIDAR_M = (*RADAR_FROM_LIDAR_M[:2], KRADAR_RADAR_FROM_LIDAR_Z_M)
 
 
@@ -156,11 +155,9 @@ class Detector:
         self.classes = tuple(config.classes)
         self.decode_options = dataclasses.asdict(DecodeOptions(**config.decode))
         self.sharding = sharding or SingleDeviceSharding(jax.devices()[0])
-        self.replicated = (
-            NamedSharding(self.sharding.mesh, PartitionSpec())
-            if isinstance(self.sharding, NamedSharding)
-            else self.sharding
-        )
+        self.replicated = self.sharding
+        if isinstance(self.sharding, NamedSharding):
+            self.replicated = NamedSharding(self.sharding.mesh, PartitionSpec())
         self._set_batch_sizes(batch_sizes)
         cache_compiled_programs()
         self.variables = jax.device_put(saved.variables, self.replicated)
@@ -387,7 +384,7 @@ class Detector:
         shape = (batch_size, *steps, *self.grid.projection_shape)
         inputs: tuple[Any, ...] = (np.zeros(shape, np.float32),)
         if self.takes_camera:
-            images, camera = placeholder(batch_size, self.model)
+            images, camera = no_images(batch_size, self.model.image_size)
             inputs += images, camera.replace(is_valid=np.ones(batch_size, bool))
         jax.block_until_ready(self(*inputs))
         return self
@@ -418,7 +415,7 @@ def _projections(
 ) -> Float[np.ndarray, "B R A DE"]:
     """Compute the float32 projections of tesseracts, or convert stored projections."""
     if radar.ndim == 5:
-        radar = grid.measured_channels(_project(radar))
+        radar = grid.measured_channels(project_jax(radar))
     return np.asarray(to_float(radar))
 
 
@@ -653,12 +650,9 @@ def _cameras(
         return camera
     if not isinstance(camera, list | tuple):
         camera = [camera] * num_frames
-    return stack_cameras(
-        [
-            no_camera(model.image_size) if one is None else _one_camera(one, options)
-            for one in camera
-        ]
-    )
+    none = no_camera(model.image_size)
+    cameras = [none if one is None else _one_camera(one, options) for one in camera]
+    return stack_cameras(cameras)
 
 
 def _one_camera(camera: Camera | Calibration, options: CameraOptions) -> Camera:
@@ -674,14 +668,6 @@ def _one_camera(camera: Camera | Calibration, options: CameraOptions) -> Camera:
     shift_m = np.array(options.shift(own_m, own_m[2]))
     camera = dataclasses.replace(camera, radar_from_lidar_m=shift_m)
     return camera.camera(options.projection)
-
-
-def placeholder(
-    num_frames: int, model: Any
-) -> tuple[UInt8[np.ndarray, "{num_frames} H W 3"], Camera]:
-    """Return black images and a batch of invalid cameras in the shapes of real ones."""
-    image = np.zeros((num_frames, *model.image_size, 3), np.uint8)
-    return image, stack_cameras([no_camera(model.image_size)] * num_frames)
 
 
 def check_backbone(

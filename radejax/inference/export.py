@@ -24,10 +24,11 @@ import radejax
 from radejax.core import files
 from radejax.core.errors import UserError, require
 from radejax.core.structures import to_float
+from radejax.data.cameras import no_images
 from radejax.data.projection import project_jax
 from radejax.geometry.camera import Camera
 from radejax.inference import exported_loader
-from radejax.inference.detector import SETTINGS, Detector, placeholder
+from radejax.inference.detector import SETTINGS, Detector
 from radejax.inference.saved import save_model
 from radejax.models.dinorade import IMAGE_BACKBONE
 
@@ -180,7 +181,8 @@ def _exported(
         return variables, (radar,)
     model = detector.model
     image, camera = jax.tree.map(
-        lambda x: _array(batch, *x.shape[1:], dtype=x.dtype), placeholder(1, model)
+        lambda x: _array(batch, *x.shape[1:], dtype=x.dtype),
+        no_images(1, model.image_size),
     )
     if not (with_backbone or model.vit is None):
         variables["params"].pop(IMAGE_BACKBONE, None)

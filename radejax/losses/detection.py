@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any, Literal, NamedTuple, get_args
 
 import jax
@@ -76,6 +75,12 @@ class LossOptions:
     def __post_init__(self) -> None:
         terms = self.terms
         own = terms.keys() - LOSSES.keys()
+
+        def are_weights(weights: Mapping[str, float]) -> bool:
+            are_numbers = all(0 <= weight < math.inf for weight in weights.values())
+            is_complete = own <= set(weights) <= set(terms)
+            return is_complete and are_numbers and any(weights.values())
+
         ranges: dict[str, Range] = {
             "heatmap_sigma_mode": one_of(*get_args(SigmaMode)),
             "heatmap_sigma_bins": POSITIVE,
@@ -83,9 +88,7 @@ class LossOptions:
             "gwd_tau": POSITIVE,
             "assignment": one_of(*get_args(Assignment)),
             "weights": (
-                lambda weights: (
-                    own <= set(weights) <= set(terms) and _are_weights(weights)
-                ),
+                are_weights,
                 f"numbers of at least 0, not all 0, for some of {', '.join(terms)}, and "
                 "for all of own_terms",
             ),
@@ -100,11 +103,6 @@ class LossOptions:
             for place in self.own_terms
         }
         return LOSSES | own
-
-
-def _are_weights(weights: Mapping[str, float]) -> bool:
-    numbers = weights.values()
-    return all(0 <= weight < math.inf for weight in numbers) and any(numbers)
 
 
 def detection_loss(
@@ -160,12 +158,11 @@ def detection_loss(
         sigma_mode=chosen.heatmap_sigma_mode,
         sigma_bins=chosen.heatmap_sigma_bins,
     )
-    assign = (
-        _at_centers
-        if chosen.assignment == "center"
-        else partial(_after_nms, chosen.decoding)
-    )
-    predicted, expected, is_matched = assign(maps, boxes, is_valid, grid)
+    if chosen.assignment == "center":
+        assigned = _at_centers(maps, boxes, is_valid, grid)
+    else:
+        assigned = _after_nms(chosen.decoding, maps, boxes, is_valid, grid)
+    predicted, expected, is_matched = assigned
     row = is_matched[..., None]
     pairs = Pairs(
         maps.heatmap_logits,

@@ -8,7 +8,7 @@ from typing import Any
 
 import flax.linen as nn
 
-from radejax.core.config import find_part
+from radejax.core.config import find_part, plain
 from radejax.core.errors import UserError, check_options, one_of
 from radejax.geometry.radar_grid import AzimuthMapping, RadarGrid
 from radejax.models.dinorade import DinoRade
@@ -37,7 +37,7 @@ def build(config: Mapping[str, Any], num_frames: int = 1) -> nn.Module:
         UserError: The name is unknown, or a field is missing, unknown or out of range or
             has the wrong type.
     """
-    fields = _plain(config)
+    fields = plain(config)
     name = fields.pop("name", None)
     module = find_part(name, "config.model.name", _MODELS, RadeNet)
     expected, is_camera = _own_fields(module), issubclass(module, DinoRade)
@@ -76,15 +76,6 @@ def _with_camera(fields: dict[str, Any]) -> dict[str, Any]:
         "resnet_width": image["resnet_width"],
         "standardize_image": image["standardize"],
     }
-
-
-def _plain(config: Any) -> Any:
-    """Converts mappings to dictionaries and lists to tuples, recursively."""
-    if isinstance(config, list | tuple):
-        return tuple(map(_plain, config))
-    if isinstance(config, Mapping) or hasattr(config, "items"):
-        return {name: _plain(value) for name, value in config.items()}
-    return config
 
 
 def _own_fields(module: Any) -> set[str]:

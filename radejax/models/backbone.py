@@ -15,16 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from radejax.models.layers import (
-    Conv,
-    ConvGNSiLU,
-    Dense,
-    DoubleConvResidual,
-    Features,
-    Map,
-    Upsample,
-    max_pool,
-)
+from radejax.models import layers
+from radejax.models.layers import ConvGNSiLU, Features, Map
 
 CBAMKind = Literal["official", "paper"]
 
@@ -48,8 +40,8 @@ class ChannelAttention(nn.Module):
     def __call__(self, x: Map) -> Map:
         channels = x.shape[-1]
         hidden = max(1, channels // REDUCTION)
-        squeeze = Dense(hidden, dtype=self.dtype, name="squeeze")
-        excite = Dense(channels, dtype=self.dtype, name="excite")
+        squeeze = layers.Dense(hidden, dtype=self.dtype, name="squeeze")
+        excite = layers.Dense(channels, dtype=self.dtype, name="excite")
         mean = x.mean((1, 2), dtype=jnp.float32).astype(self.dtype)
         pooled = jnp.stack([x.max((1, 2)), mean])  # [2, B, C]
         weight = nn.sigmoid(excite(nn.relu(squeeze(pooled))).sum(0))
@@ -75,7 +67,7 @@ class SpatialAttention(nn.Module):
     def __call__(self, x: Map) -> Float[jax.Array, "B R A 1"]:
         mean = x.mean(-1, dtype=jnp.float32).astype(self.dtype)
         pooled = [mean, x.max(-1)] if self.mean_first else [x.max(-1), mean]
-        conv = Conv(1, 7, dtype=self.dtype, name="conv")
+        conv = layers.Conv(1, 7, dtype=self.dtype, name="conv")
         return nn.sigmoid(conv(jnp.stack(pooled, -1)))
 
 
@@ -97,14 +89,15 @@ class CBAM(nn.Module):
     @nn.compact
     def __call__(self, x: Map) -> Map:
         is_official = self.kind == "official"
-        channels = x.shape[-1]
+        block = functools.partial(
+            ConvGNSiLU, x.shape[-1], self.num_groups, dtype=self.dtype
+        )
         if is_official:
-            x = ConvGNSiLU(channels, self.num_groups, dtype=self.dtype, name="start")(x)
+            x = block(name="start")(x)
         y = ChannelAttention(dtype=self.dtype, name="channel")(x)
         y = y * SpatialAttention(not is_official, dtype=self.dtype, name="spatial")(y)
         if is_official:
-            y = y + x
-            y = ConvGNSiLU(channels, self.num_groups, dtype=self.dtype, name="end")(y)
+            y = block(name="end")(y + x)
         return y
 
 
@@ -173,23 +166,23 @@ class Backbone(nn.Module):
     def __call__(self, x: Features) -> Features:
         wrap = nn.remat if self.remat else lambda module: module
         shared: dict[str, Any] = {"num_groups": self.num_groups, "dtype": self.dtype}
-        block = functools.partial(wrap(DoubleConvResidual), **shared)
+        block = functools.partial(wrap(layers.DoubleConvResidual), **shared)
         if self.input_stem:
             stem = InputStem(self.widths[0], self.doppler_bins, **shared, name="stem")
             x = stem(x)
         else:
-            x = Conv(self.widths[0], dtype=self.dtype, name="start")(x)
+            x = layers.Conv(self.widths[0], dtype=self.dtype, name="start")(x)
         skips = []
         for i, width in enumerate(self.widths, 1):
             x = block(width, name=f"encoder_{i}")(x)
             skips.append(x)
-            x = max_pool(x)
+            x = layers.max_pool(x)
         for i in (1, 2):
             x = block(self.widths[-1], name=f"bottleneck_{i}")(x)
         decoder_widths = (*self.widths[-2::-1], self.decoder_width)
         for i, width in enumerate(decoder_widths, 1):
             skip = skips.pop()
-            x = Upsample(x.shape[-1], dtype=self.dtype, name=f"upsample_{i}")(x)
+            x = layers.Upsample(x.shape[-1], dtype=self.dtype, name=f"upsample_{i}")(x)
             if self.cbam is not None:
                 skip = wrap(CBAM)(self.cbam, **shared, name=f"cbam_{i}")(skip)
             x = block(width, name=f"decoder_{i}")(jnp.concatenate([x, skip], -1))

@@ -17,6 +17,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
+Inputs = Float[jax.Array, "B R A C"]
+Outputs = Float[jax.Array, "B R A F"]
+Kernel = Float[jax.Array, "k k C F"]
+
 _DIMENSION_NUMBERS = ("NHWC", "HWIO", "NHWC")
 
 _BLOCK_BINS = 900
@@ -28,11 +32,7 @@ _MIN_WEIGHTS = 128 * 128
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
-def conv2d(
-    x: Float[jax.Array, "B R A C"],
-    kernel: Float[jax.Array, "k k C F"],
-    dilation: int = 1,
-) -> Float[jax.Array, "B R A F"]:
+def conv2d(x: Inputs, kernel: Kernel, dilation: int = 1) -> Outputs:
     """Computes a convolution with stride 1 and zero padding that keeps the map's size.
 
     The function has a custom VJP, so it can be differentiated in reverse mode only.
@@ -107,21 +107,14 @@ conv2d.defvjp(_forward, _backward)
 
 
 def _kernel_gradient(
-    size: int,
-    dilation: int,
-    x: Float[jax.Array, "B R A C"],
-    grad: Float[jax.Array, "B R A F"],
+    size: int, dilation: int, x: Inputs, grad: Outputs
 ) -> Float[jax.Array, "{size} {size} C F"]:
     kernel = jnp.zeros((size, size, x.shape[-1], grad.shape[-1]), x.dtype)
     return jax.vjp(lambda k: plain_conv2d(x, k, dilation), kernel)[1](grad)[0]
 
 
 def blocked_kernel_gradient(
-    x: Float[jax.Array, "B R A C"],
-    grad: Float[jax.Array, "B R A F"],
-    *,
-    size: int,
-    dilation: int,
+    x: Inputs, grad: Outputs, *, size: int, dilation: int
 ) -> Float[jax.Array, "{size} {size} C F"]:
     """Computes the gradient of `conv2d` with respect to its kernel, over blocks of rows.
 

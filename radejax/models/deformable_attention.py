@@ -29,6 +29,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 Arrays = tuple[jax.Array, ...]
+Places = Float[jax.Array, "*places"]
 
 _CHUNK_SIZES = {"cpu": 448, "default": 8192}
 """Bins per chunk.
@@ -331,10 +332,7 @@ def _lifted_samples(
 
 
 def _corners(
-    x: Float[jax.Array, "*places"],
-    y: Float[jax.Array, "*places"],
-    height: int,
-    width: int,
+    x: Places, y: Places, height: int, width: int
 ) -> tuple[Int[jax.Array, "*places 4"], Float[jax.Array, "*places 4"]]:
     """Returns indices and bilinear weights `[..., 4]` of the four pixels around a location.
 

@@ -14,14 +14,10 @@ from jaxtyping import Float, Real
 from radejax.core.errors import SIZE, UserError, check_options, require
 from radejax.core.structures import DetectionMaps
 from radejax.geometry.camera import Camera
+from radejax.models import lifting
 from radejax.models.fusion import Fusion
 from radejax.models.image import STRIDE, CameraNeck, ResNetNeck, ResNetTrunk, normalize
-from radejax.models.lifting import (
-    MARGIN_PX,
-    LiftingAxes,
-    ReferencePoints,
-    reference_points,
-)
+from radejax.models.lifting import MARGIN_PX, LiftingAxes, ReferencePoints
 from radejax.models.radenet import RadeNet
 from radejax.models.vit import ViT
 
@@ -58,37 +54,27 @@ class DinoRade(RadeNet, kw_only=True):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_options(vars(self), "config.model.image", {"resnet_width": SIZE})
-        require(
-            self.freeze or self.vit is not None,
-            "config.model.image.freeze",
-            self.freeze,
-            "True for a ResNet, whose first stages have fixed batch statistics",
-        )
+        image, size = "config.model.image", self.image_size
+        check_options(vars(self), image, {"resnet_width": SIZE})
+        is_possible = self.freeze or self.vit is not None
+        expected = "True for a ResNet, whose first stages have fixed batch statistics"
+        require(is_possible, f"{image}.freeze", self.freeze, expected)
         least, step = (STRIDE, STRIDE) if self.vit is None else (self.vit.patch_size, 1)
-        require(
-            len(self.image_size) == 2
-            and all(n >= least and n % step == 0 for n in self.image_size),
-            "config.model.image.size",
-            self.image_size,
-            f"height and width of at least {least} pixels, multiples of {step}",
-        )
-        require(
-            self.fusion.out_of_view == "drop" or self.image_size[1] > 2 * MARGIN_PX,
-            "config.model.image.size",
-            self.image_size,
+        is_possible = len(size) == 2 and all(n >= least and n % step == 0 for n in size)
+        expected = f"height and width of at least {least} pixels, multiples of {step}"
+        require(is_possible, f"{image}.size", size, expected)
+        is_possible = self.fusion.out_of_view == "drop" or size[1] > 2 * MARGIN_PX
+        expected = (
             f"a width above {2 * MARGIN_PX} for config.model.fusion.out_of_view = "
-            f"'official', which leaves out {MARGIN_PX} pixels left and right",
+            f"'official', which leaves out {MARGIN_PX} pixels left and right"
         )
+        require(is_possible, f"{image}.size", size, expected)
         kind, name = self.fusion.weighting, "config.model.fusion.weighting"
         is_possible = self.elevation_bins > 0 or kind == "off"
         require(is_possible, name, kind, "'off' without elevation channels")
-        require(
-            self.decoder_width % self.fusion.num_heads == 0,
-            "config.model.fusion.num_heads",
-            self.fusion.num_heads,
-            f"a divisor of decoder_width = {self.decoder_width}",
-        )
+        heads, width = self.fusion.num_heads, self.decoder_width
+        expected = f"a divisor of decoder_width = {width}"
+        require(width % heads == 0, "config.model.fusion.num_heads", heads, expected)
 
     def setup(self) -> None:
         shared = self._shared()
@@ -197,7 +183,9 @@ class DinoRade(RadeNet, kw_only=True):
         if isinstance(camera, Camera):
             arrays = jax.tree.map(jnp.asarray, camera)
             out_of_view = self.fusion.out_of_view
-            camera = reference_points(arrays, self.query_grid, r, a, out_of_view)
+            camera = lifting.reference_points(
+                arrays, self.query_grid, r, a, out_of_view
+            )
         expected = (r, a, self.query_grid.num_elevation)
         found = camera.is_valid.shape
         if found[1:] != expected or found[0] not in (1, b):

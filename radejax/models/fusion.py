@@ -16,16 +16,11 @@ from jaxtyping import Bool, Float, Real
 
 from radejax.core.errors import BELOW_ONE, SIZE, check_options, integer, one_of
 from radejax.core.structures import Array
+from radejax.models import lifting
 from radejax.models.deformable_attention import DeformableAttention
 from radejax.models.heads import DilatedNeck
 from radejax.models.layers import Dense, Map
-from radejax.models.lifting import (
-    OutOfViewRule,
-    ReferencePoints,
-    WeightingKind,
-    WeightingNetwork,
-    query_weights,
-)
+from radejax.models.lifting import OutOfViewRule, ReferencePoints, WeightingKind
 
 GateKind = Literal["channel", "bin"]
 
@@ -72,9 +67,7 @@ class Fusion(nn.Module):
     def __post_init__(self) -> None:
         super().__post_init__()
         ranges = {
-            "num_heads": SIZE,
-            "num_points": SIZE,
-            "num_elevation": SIZE,
+            **dict.fromkeys(("num_heads", "num_points", "num_elevation"), SIZE),
             "chunk_size": integer(0, 1 << 16),
             "weighting": one_of(*get_args(WeightingKind)),
             "gate": one_of(*get_args(GateKind)),
@@ -117,24 +110,20 @@ class Fusion(nn.Module):
             return dropout(radar)
         if self.necks:
             camera = self._neck("camera_neck")(camera)
-        weights = WeightingNetwork(
+        weights = lifting.WeightingNetwork(
             self.num_elevation, self.weighting, self.dtype, name="weighting"
         )(elevation)  # [B, R, A, E]
         scale = weights * reference.is_valid
-        mean = query_weights(jnp.asarray(reference.is_valid), self.out_of_view)
+        mean = lifting.query_weights(jnp.asarray(reference.is_valid), self.out_of_view)
 
         def per_bin(x: Real[Array, "_ R A ..."]) -> Real[jax.Array, "_ bins ..."]:
             return jnp.asarray(x).reshape(x.shape[0], r * a, *x.shape[3:])
 
         counts = self.num_heads, self.num_points, self.chunk_size
         attention = DeformableAttention(c, *counts, self.dtype, name="attention")
-        queries = (
-            per_bin(radar),
-            per_bin(scale),
-            per_bin(reference.points),
-            per_bin(mean),
-        )
-        seen = attention(*queries, camera).reshape(b, r, a, c)
+        points, means = per_bin(reference.points), per_bin(mean)
+        seen = attention(per_bin(radar), per_bin(scale), points, means, camera)
+        seen = seen.reshape(b, r, a, c)
         share = self._camera_share(radar, seen)
         share = share * self._has_camera(reference, mean).astype(share.dtype)
         self.sow("intermediates", "camera_share", share.mean(-1))

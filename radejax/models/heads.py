@@ -40,13 +40,8 @@ class DilatedResidual(nn.Module):
     @nn.compact
     def __call__(self, x: Map) -> Map:
         features = x.shape[-1]
-        y = ConvGNSiLU(
-            features,
-            self.num_groups,
-            dilation=self.dilation,
-            dtype=self.dtype,
-            name="conv_1",
-        )(x)
+        block = functools.partial(ConvGNSiLU, dilation=self.dilation, dtype=self.dtype)
+        y = block(features, self.num_groups, name="conv_1")(x)
         y = Conv(features, dtype=self.dtype, name="conv_2")(y)
         y = GroupNorm(self.num_groups, dtype=self.dtype, name="norm")(y)
         return nn.silu(x + y)

@@ -11,6 +11,7 @@ References:
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import flax.linen as nn
@@ -185,10 +186,8 @@ class FrozenBatchNorm(nn.Module):
         scale, var = self.param("scale", ones, shape), self.param("var", ones, shape)
         bias, mean = self.param("bias", zeros, shape), self.param("mean", zeros, shape)
         factor = scale * jax.lax.rsqrt(var + 1e-5)
-        shift = jnp.expand_dims(bias - mean * factor, (0, 1, 2))
-        return x * jnp.expand_dims(factor, (0, 1, 2)).astype(self.dtype) + shift.astype(
-            self.dtype
-        )
+        shift = jnp.expand_dims(bias - mean * factor, (0, 1, 2)).astype(self.dtype)
+        return x * jnp.expand_dims(factor, (0, 1, 2)).astype(self.dtype) + shift
 
 
 def _conv(features: int, size: int, stride: int, dtype: Any, name: str) -> Conv:
@@ -236,6 +235,15 @@ class Bottleneck(nn.Module):
         return nn.relu(x + y)
 
 
+def _stage(
+    name: str, depth: int, features: int, stride: int, frozen: bool, dtype: Any
+) -> Iterator[Bottleneck]:
+    """Yields the blocks of a stage, of which the first has the stride."""
+    for i in range(depth):
+        own = f"{name}_{i + 1}"
+        yield Bottleneck(features, 1 if i else stride, i == 0, frozen, dtype, name=own)
+
+
 class ResNetTrunk(nn.Module):
     """Stem and first three stages of a ResNet, with a stride of 16 in total.
 
@@ -260,15 +268,10 @@ class ResNetTrunk(nn.Module):
         x = nn.relu(_normalized(x, "stem_norm", self.frozen, self.dtype, train))
         x = nn.max_pool(x, (3, 3), (2, 2), ((1, 1), (1, 1)))
         for stage, depth in enumerate(self.depths, 1):
-            for i in range(depth):
-                x = Bottleneck(
-                    self.width * 2 ** (stage - 1),
-                    stride=2 if stage > 1 and i == 0 else 1,
-                    is_first=i == 0,
-                    frozen=self.frozen,
-                    dtype=self.dtype,
-                    name=f"stage_{stage}_block_{i + 1}",
-                )(x, train)
+            shape = self.width * 2 ** (stage - 1), 1 if stage == 1 else 2
+            kind = *shape, self.frozen, self.dtype
+            for block in _stage(f"stage_{stage}_block", depth, *kind):
+                x = block(x, train)
         return x.astype(jnp.float32)
 
 
@@ -293,13 +296,6 @@ class ResNetNeck(nn.Module):
     ) -> Float[jax.Array, "B (h+1)//2 (w+1)//2 {self.features}"]:
         """Runs the neck; the arguments are those of `CameraNeck`, with x the trunk's output."""
         mask = counted_frames(has_image)
-        for i in range(self.depth):
-            x = Bottleneck(
-                8 * self.width,
-                stride=2 if i == 0 else 1,
-                is_first=i == 0,
-                frozen=False,
-                dtype=self.dtype,
-                name=f"block_{i + 1}",
-            )(x, train, mask)
+        for block in _stage("block", self.depth, 8 * self.width, 2, False, self.dtype):
+            x = block(x, train, mask)
         return Conv(self.features, 1, use_bias=False, dtype=self.dtype, name="proj")(x)

@@ -204,14 +204,8 @@ class ConvGNSiLU(nn.Module):
 
     @nn.compact
     def __call__(self, x: Features) -> Features:
-        x = Conv(
-            self.features,
-            self.size,
-            self.dilation,
-            use_bias=self.use_bias,
-            dtype=self.dtype,
-            name="conv",
-        )(x)
+        conv = functools.partial(Conv, use_bias=self.use_bias, dtype=self.dtype)
+        x = conv(self.features, self.size, self.dilation, name="conv")(x)
         x = GroupNorm(self.num_groups, dtype=self.dtype, name="norm")(x)
         return nn.silu(x)
 

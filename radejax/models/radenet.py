@@ -14,16 +14,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
+from radejax.core import errors
 from radejax.core.config import find_part
-from radejax.core.errors import (
-    POSITIVE,
-    SIZE,
-    UserError,
-    check_options,
-    integer,
-    one_of,
-    require,
-)
+from radejax.core.errors import UserError, require
 from radejax.core.structures import DetectionMaps
 from radejax.models.backbone import BACKBONES, Backbone, CBAMKind
 from radejax.models.heads import HEADS, NECKS, Head, Heads, Neck
@@ -96,20 +89,20 @@ class RadeNet(nn.Module):
         sizes += ["num_frames"]
         channels = ["doppler_bins", "elevation_bins"]
         ranges = {
-            **dict.fromkeys(sizes, SIZE),
-            **dict.fromkeys(channels, integer(0, 1 << 16)),
+            **dict.fromkeys(sizes, errors.SIZE),
+            **dict.fromkeys(channels, errors.integer(0, 1 << 16)),
             "widths": (
-                lambda widths: len(widths) > 0 and all(map(SIZE[0], widths)),
+                lambda widths: len(widths) > 0 and all(map(errors.SIZE[0], widths)),
                 "one or several integers of at least 1",
             ),
-            "cbam": one_of("official", "paper", None),
-            "dtype": one_of("float32", "bfloat16"),
-            "remat": one_of(*REMAT),
+            "cbam": errors.one_of("official", "paper", None),
+            "dtype": errors.one_of("float32", "bfloat16"),
+            "remat": errors.one_of(*REMAT),
             "heatmap_prior": (lambda prior: 0 < prior < 1, "a number in (0, 1)"),
             "input_center": (math.isfinite, "a finite number"),
-            "input_scale": POSITIVE,
+            "input_scale": errors.POSITIVE,
         }
-        check_options(vars(self), "config.model", ranges)
+        errors.check_options(vars(self), "config.model", ranges)
         find_part(self.backbone, "config.model.backbone", BACKBONES, Backbone)
         find_part(self.neck, "config.model.neck", NECKS, Neck)
         find_part(self.heads, "config.model.heads", HEADS, Head)
@@ -117,12 +110,9 @@ class RadeNet(nn.Module):
         is_some = self.doppler_bins + self.elevation_bins > 0
         require(is_some, "config.model.elevation_bins", self.elevation_bins, least)
         stride = 2 ** len(self.widths)
-        require(
-            self.pad_multiple % stride == 0,
-            "config.model.pad_multiple",
-            self.pad_multiple,
-            f"a multiple of {stride} for {len(self.widths)} levels",
-        )
+        expected = f"a multiple of {stride} for {len(self.widths)} levels"
+        is_whole, name = self.pad_multiple % stride == 0, "config.model.pad_multiple"
+        require(is_whole, name, self.pad_multiple, expected)
         widths = {f"widths[{i}]": width for i, width in enumerate(self.widths)}
         widths["decoder_width"] = self.decoder_width
         if self.heads == "default":
@@ -130,13 +120,10 @@ class RadeNet(nn.Module):
             widths["decoder_width / 2 (default heads)"] = half
         if self.input_stem:
             widths["widths[0] / 2 (input stem)"] = self.widths[0] // 2
+        expected = f"a multiple of num_groups = {self.num_groups}"
         for name, width in widths.items():
-            require(
-                width > 0 and width % self.num_groups == 0,
-                f"config.model: {name}",
-                width,
-                f"a multiple of num_groups = {self.num_groups}",
-            )
+            is_multiple = width > 0 and width % self.num_groups == 0
+            require(is_multiple, f"config.model: {name}", width, expected)
 
     @nn.compact
     def __call__(self, projection: Projection, *, train: bool = False) -> DetectionMaps:

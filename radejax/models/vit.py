@@ -83,12 +83,9 @@ class ViT(nn.Module):
             "attention": one_of(*get_args(AttentionKind)),
         }
         check_options(vars(self), "config.model.image", ranges)
-        require(
-            self.hidden_size % (4 * self.num_heads) == 0,
-            "config.model.image.hidden_size",
-            self.hidden_size,
-            f"a multiple of 4 channels for each of {self.num_heads} heads",
-        )
+        size, name = self.hidden_size, "config.model.image.hidden_size"
+        expected = f"a multiple of 4 channels for each of {self.num_heads} heads"
+        require(size % (4 * self.num_heads) == 0, name, size, expected)
 
     @property
     def num_prefix(self) -> int:

@@ -9,16 +9,9 @@ import math
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from radejax.core.errors import (
-    POSITIVE,
-    UserError,
-    check_options,
-    integer,
-    number,
-    one_of,
-    require,
-    several,
-)
+from radejax.core import errors
+from radejax.core.config import plain
+from radejax.core.errors import UserError, integer, number, require
 from radejax.geometry.radar_grid import RadarGrid, is_uniform
 from radejax.simulation.radar.tensor import RadarParameters
 
@@ -55,10 +48,10 @@ _RANGES = {
     "image_width": integer(0),
     "image_height": integer(0),
     "vru_density_scale": number(0, 5),  # more leaves no space for other road users
-    "output": one_of("tesseract", "projection"),
-    "camera_mode": one_of("scene", "oracle"),
-    "label_distance_m": POSITIVE,
-    "radar_from_lidar_m": several(number(-math.inf), "three numbers", 3),
+    "output": errors.one_of("tesseract", "projection"),
+    "camera_mode": errors.one_of("scene", "oracle"),
+    "label_distance_m": errors.POSITIVE,
+    "radar_from_lidar_m": errors.several(number(-math.inf), "three numbers", 3),
 }
 
 FULL_SIZE = {
@@ -146,22 +139,18 @@ class SimulationConfig:
         Raises:
             UserError: A field is unknown or out of its range.
         """
-        values = dict(plain(values))
+        values = plain(values)
         fields = {field.name: field for field in dataclasses.fields(cls)}
         for name in values:
             require(name in fields, "config.simulation field", name, ", ".join(fields))
-        for name in ("sequences", "radar_from_lidar_m"):
-            if isinstance(values.get(name), list):
-                values[name] = tuple(values[name])
         return cls(**values)
 
     def __post_init__(self) -> None:
-        check_options(vars(self), "config.simulation", _RANGES)
+        errors.check_options(vars(self), "config.simulation", _RANGES)
         if self.scenes == "procedural":
             is_any = self.train_sequences + self.test_sequences > 0
-            self._require(
-                is_any, "train_sequences", "a sequence to train or to test on"
-            )
+            expected = "a sequence to train or to test on"
+            self._require(is_any, "train_sequences", expected)
             frames = "an integer of at least 1"
             self._require(self.frames_per_sequence > 0, "frames_per_sequence", frames)
             selects = "None: it selects sequences of real labels"
@@ -215,12 +204,3 @@ class SimulationConfig:
 def default_config() -> dict[str, Any]:
     """Returns the fields of `SimulationConfig` with their defaults as a new dictionary."""
     return dataclasses.asdict(SimulationConfig())
-
-
-def plain(config: Any) -> Any:
-    """Converts ConfigDicts and other mappings to dictionaries, recursively."""
-    if hasattr(config, "to_dict"):
-        config = config.to_dict()
-    if isinstance(config, Mapping):
-        return {str(key): plain(value) for key, value in config.items()}
-    return config

@@ -17,7 +17,7 @@ import logging
 import os
 import pathlib
 import pickle
-from collections.abc import Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from typing import Any, TypeVar
 
 import jax
@@ -41,7 +41,6 @@ from radejax.simulation.simulator import (
     SceneSource,
     SequenceSimulator,
     make_source,
-    simulate_radar,
 )
 
 __all__ = ["default_config", "simulate_dataset"]
@@ -93,8 +92,9 @@ def simulate_dataset(
     with files.disk_full(root / SIMULATION_MARKER):
         files.write_json(root / SIMULATION_MARKER, content)
         files.remove_stale(root)
-        _write_common(root, checked, source)
-        _write_frames(root, checked, source, num_workers, progress)
+        writer = Writer(root, checked, source)
+        writer.write_common()
+        writer.write_frames(num_workers, progress)
         files.write_json(root / SIMULATION_MARKER, content | {"finished": True})
     return root
 
@@ -126,12 +126,8 @@ def _is_finished(root: pathlib.Path, config: SimulationConfig) -> bool:
                 " choose another folder"
             )
         return False
-    files.claim(
-        marker,
-        _marker(config),
-        "a dataset of another simulation config",
-        ignore=("finished",),
-    )
+    what = "a dataset of another simulation config"
+    files.claim(marker, _marker(config), what, ignore=("finished",))
     return files.read_object(marker, "finished")["finished"] is True
 
 
@@ -144,128 +140,98 @@ def _marker(config: SimulationConfig) -> dict[str, Any]:
     }
 
 
-def _cameras(config: SimulationConfig) -> tuple[CameraCalibration, ...]:
-    """Returns the left and right camera, or an empty tuple without images."""
-    if not config.image_width:
-        return ()
-    size = config.image_width, config.image_height
-    return stereo_calibration(config.radar_from_lidar_m, *size)
-
-
-def _write_common(
-    root: pathlib.Path, config: SimulationConfig, source: SceneSource
-) -> None:
-    """Writes the splits, the sensor axes and the camera calibrations."""
-    names: dict[str, list[tuple[int, str]]] = {"train": [], "test": []}
-    for number in source.numbers:
-        for spec in source.frames(number):
-            names[spec.split].append((number, spec.name))
-    kradar_write.write_splits(root / "split", **names)
-    if config.grid != "kradar":
-        kradar_write.write_grid(root, config.make_grid())
-    for index, calibration in enumerate(_cameras(config)):
-        path = root / "calib" / "common" / f"cam_front{index}.yml"
-        files.write_text(path, calibration.to_kradar_text())
-
-
-def _write_frames(
-    root: pathlib.Path,
-    config: SimulationConfig,
-    source: SceneSource,
-    num_workers: int | None,
-    progress: bool,
-) -> None:
-    """Writes every frame that does not exist yet."""
-    missing = list(_missing(root, config, source))
-    total = sum(len(source.frames(n)) for n in source.numbers)
-    if num_workers is None:
-        num_workers = (os.cpu_count() or 1) if len(missing) > _FEW_FRAMES else 0
-    compute = functools.partial(
-        simulate_radar,
-        grid=config.make_grid(),
-        parameters=config.make_parameters(),
-        output=config.output,
-    )
-    with (
-        tqdm(
-            total=total, unit="frame", desc="simulate", disable=not progress
-        ) as progress_bar,
-        contextlib.closing(
-            _prepared(num_workers, missing, root, config, source)
-        ) as frames,
-    ):
-        progress_bar.update(total - len(missing))
-        computed = (
-            (number, spec, compute(given), labels)
-            for number, spec, given, labels in frames
-        )
-        # The device computes the next frame while this one is written.
-        for frame in _started_ahead(computed, 1):
-            _write_frame(root, config, *frame)
-            progress_bar.update()
-
-
-def _missing(
-    root: pathlib.Path, config: SimulationConfig, source: SceneSource
-) -> Iterator[tuple[int, FrameSpec]]:
-    """Yields the frames without a label file, and writes the files of each sequence.
-
-    These files are the description and the calibration.
-    """
-    for number in source.numbers:
-        folder, specs = root / str(number), source.frames(number)
-        kradar_write.write_description(
-            folder / "description.txt", *source.conditions(number)
-        )
-        radar_idx, lidar_idx, *_ = specs[0].indices
-        kradar_write.write_calibration(
-            folder / "info_calib" / "calib_radar_lidar.txt",
-            radar_idx - lidar_idx,
-            *config.radar_from_lidar_m[:2],
-        )
-        there = {path.stem for path in (folder / _LABELS).glob("*.txt")}
-        yield from ((number, spec) for spec in specs if spec.name not in there)
-
-
-def _write_frame(
-    root: pathlib.Path,
-    config: SimulationConfig,
-    number: int,
-    spec: FrameSpec,
-    output: jax.Array,
-    labels: list[Label],
-) -> None:
-    """Writes the radar data of one frame, then its labels."""
-    folder, index = root / str(number), spec.indices[0]
-    if config.output == "tesseract":
-        path = folder / "radar_tesseract" / f"tesseract_{index:05d}.mat"
-        tesseract = np.asarray(output).transpose(tensor.TESSERACT_OF_ROWS)
-        kradar_write.write_tesseract(path, tesseract)
-    else:
-        path = folder / "DERA_tesseract" / f"DERA_tesseract_{index:05d}.npy"
-        with files.atomic_write(path) as file:
-            np.save(file, np.moveaxis(np.asarray(output), -1, 0))  # [D+E, R, A]
-    path = folder / _LABELS / f"{spec.name}.txt"
-    kradar_write.write_labels(path, spec.indices, spec.timestamp_s, labels)
-
-
-class _Scenes:
-    """Prepares the radar input and the labels of frames, and writes their images."""
+class Writer:
+    """Writes the files of a dataset; worker processes have a copy that prepares frames."""
 
     def __init__(
         self, root: pathlib.Path, config: SimulationConfig, source: SceneSource
     ) -> None:
-        self._root, self._config, self._source = root, config, source
-        self._sequence = functools.lru_cache(maxsize=2)(self._make)
+        self.root, self.config, self.source = root, config, source
+        self.grid, self.parameters = config.make_grid(), config.make_parameters()
+        self.cameras: tuple[CameraCalibration, ...] = ()  # left and right
+        if config.image_width:
+            size = config.image_width, config.image_height
+            self.cameras = stereo_calibration(config.radar_from_lidar_m, *size)
+
+    def write_common(self) -> None:
+        """Writes the splits, the sensor axes and the camera calibrations."""
+        names: dict[str, list[tuple[int, str]]] = {"train": [], "test": []}
+        for number in self.source.numbers:
+            for spec in self.source.frames(number):
+                names[spec.split].append((number, spec.name))
+        kradar_write.write_splits(self.root / "split", **names)
+        if self.config.grid != "kradar":
+            kradar_write.write_grid(self.root, self.grid)
+        for index, calibration in enumerate(self.cameras):
+            path = self.root / "calib" / "common" / f"cam_front{index}.yml"
+            files.write_text(path, calibration.to_kradar_text())
+
+    def write_frames(self, num_workers: int | None, progress: bool) -> None:
+        """Writes every frame that does not exist yet."""
+        missing = list(self._missing())
+        total = sum(len(self.source.frames(n)) for n in self.source.numbers)
+        if num_workers is None:
+            num_workers = (os.cpu_count() or 1) if len(missing) > _FEW_FRAMES else 0
+        compute = functools.partial(
+            tensor.simulate,
+            grid=self.grid,
+            parameters=self.parameters,
+            output=self.config.output,
+        )
+        with (
+            tqdm(None, "simulate", total, unit="frame", disable=not progress) as bar,
+            contextlib.closing(self._prepared(num_workers, missing)) as frames,
+        ):
+            bar.update(total - len(missing))
+            computed = (
+                (number, spec, compute(*given.arrays), labels)
+                for number, spec, given, labels in frames
+            )
+            # The device computes the next frame while this one is written.
+            for frame in _started_ahead(computed, 1):
+                self.write_frame(*frame)
+                bar.update()
+
+    def _missing(self) -> Iterator[tuple[int, FrameSpec]]:
+        """Yields the frames without a label file, and writes the files of each sequence.
+
+        These files are the description and the calibration.
+        """
+        for number in self.source.numbers:
+            folder, specs = self.root / str(number), self.source.frames(number)
+            conditions = self.source.conditions(number)
+            kradar_write.write_description(folder / "description.txt", *conditions)
+            radar_idx, lidar_idx, *_ = specs[0].indices
+            path = folder / "info_calib" / "calib_radar_lidar.txt"
+            shift_m = self.config.radar_from_lidar_m[:2]
+            kradar_write.write_calibration(path, radar_idx - lidar_idx, *shift_m)
+            there = {path.stem for path in (folder / _LABELS).glob("*.txt")}
+            yield from ((number, spec) for spec in specs if spec.name not in there)
+
+    def write_frame(
+        self, number: int, spec: FrameSpec, output: jax.Array, labels: list[Label]
+    ) -> None:
+        """Writes the radar data of one frame, then its labels."""
+        folder, index = self.root / str(number), spec.indices[0]
+        if self.config.output == "tesseract":
+            path = folder / "radar_tesseract" / f"tesseract_{index:05d}.mat"
+            tesseract = np.asarray(output).transpose(tensor.TESSERACT_OF_ROWS)
+            kradar_write.write_tesseract(path, tesseract)
+        else:
+            path = folder / "DERA_tesseract" / f"DERA_tesseract_{index:05d}.npy"
+            with files.atomic_write(path) as file:
+                np.save(file, np.moveaxis(np.asarray(output), -1, 0))  # [D+E, R, A]
+        path = folder / _LABELS / f"{spec.name}.txt"
+        kradar_write.write_labels(path, spec.indices, spec.timestamp_s, labels)
 
     def prepare(self, number: int, spec: FrameSpec) -> tuple[RadarInput, list[Label]]:
         """Computes radar input and labels of one frame and writes its image."""
-        config, camera_idx = self._config, spec.indices[2]
+        config, camera_idx = self.config, spec.indices[2]
         simulator, renderer = self._sequence(number)
         frame = simulator.sequence.frame(spec.scene_idx)
         if renderer:
             name = f"cam-front_{camera_idx:05d}.png"
-            path = self._root / str(number) / "cam-front" / name
+            path = self.root / str(number) / "cam-front" / name
             with files.atomic_write(path) as file:
                 image = Image.fromarray(renderer.render(frame))
                 image.save(file, format="PNG", compress_level=1)  # for speed
@@ -275,40 +241,41 @@ class _Scenes:
         )
         return given, labels
 
+    @functools.cached_property
+    def _sequence(self) -> Callable[[int], tuple[SequenceSimulator, Any]]:
+        """Function that makes the simulator and renderer of a sequence, with a cache."""
+        return functools.lru_cache(maxsize=2)(self._make)
+
     def _make(self, number: int) -> tuple[SequenceSimulator, CameraRenderer | None]:
-        config, sequence = self._config, self._source.make(number)
-        grid, parameters = config.make_grid(), config.make_parameters()
-        simulator = SequenceSimulator(sequence, grid, parameters, config.seed)
-        pair = _cameras(config)
-        if not pair:
+        config, sequence = self.config, self.source.make(number)
+        simulator = SequenceSimulator(sequence, self.grid, self.parameters, config.seed)
+        if not self.cameras:
             return simulator, None
         cover_lens, mode = config.cover_lens, config.camera_mode
         renderer = CameraRenderer(
-            sequence, pair, config.seed, cover_lens=cover_lens, mode=mode
+            sequence, self.cameras, config.seed, cover_lens=cover_lens, mode=mode
         )
         return simulator, renderer
 
+    def _prepared(
+        self, num_workers: int, missing: Sequence[tuple[int, FrameSpec]]
+    ) -> Generator[tuple[int, FrameSpec, RadarInput, list[Label]], None, None]:
+        """Yields the sequence number, frame, radar input and labels of each frame, in order.
 
-def _prepared(
-    num_workers: int, missing: Sequence[tuple[int, FrameSpec]], *of_scenes: Any
-) -> Generator[tuple[int, FrameSpec, RadarInput, list[Label]], None, None]:
-    """Yields the sequence number, frame, radar input and labels of each frame, in order.
-
-    The generator starts `num_workers` processes, or uses this process if it is 0. Closing
-    the generator ends the processes.
-    """
-    if not num_workers:
-        scenes = _Scenes(*of_scenes)
-        for frame in missing:
-            yield (*frame, *scenes.prepare(*frame))
-        return
-    with process_pool(num_workers, _start_worker, *of_scenes) as submit:
-        started = ((frame, submit(_prepare_in_worker, *frame)) for frame in missing)
-        for frame, future in _started_ahead(started, 2 * num_workers):
-            path = pathlib.Path(future.result())
-            given, labels = pickle.loads(path.read_bytes())
-            path.unlink()
-            yield (*frame, given, labels)
+        The generator starts `num_workers` processes, or uses this process if it is 0.
+        Closing the generator ends the processes.
+        """
+        if not num_workers:
+            for frame in missing:
+                yield (*frame, *self.prepare(*frame))
+            return
+        with process_pool(num_workers, _start_worker, self) as submit:
+            started = ((frame, submit(_prepare_in_worker, *frame)) for frame in missing)
+            for frame, future in _started_ahead(started, 2 * num_workers):
+                path = pathlib.Path(future.result())
+                given, labels = pickle.loads(path.read_bytes())
+                path.unlink()
+                yield (*frame, given, labels)
 
 
 def _started_ahead(items: Iterator[_T], count: int) -> Iterator[_T]:
@@ -322,14 +289,14 @@ def _started_ahead(items: Iterator[_T], count: int) -> Iterator[_T]:
         yield waiting.popleft()
 
 
-_scenes: Any = None
+_writer: Any = None
 
 
-def _start_worker(root: pathlib.Path, *of_scenes: Any) -> None:
+def _start_worker(writer: Writer) -> None:
     """Sets up a worker process, which uses the CPU as the parent uses the accelerator."""
-    global _scenes
+    global _writer
     jax.config.update("jax_platforms", "cpu")
-    _scenes = root, _Scenes(root, *of_scenes)
+    _writer = writer
 
 
 def _prepare_in_worker(number: int, spec: FrameSpec) -> str:
@@ -337,7 +304,6 @@ def _prepare_in_worker(number: int, spec: FrameSpec) -> str:
 
     The result itself is too large to be returned by a worker.
     """
-    root, scenes = _scenes
-    path = root / f".{number}_{spec.name}.tmp"
-    path.write_bytes(pickle.dumps(scenes.prepare(number, spec)))
+    path = _writer.root / f".{number}_{spec.name}.tmp"
+    path.write_bytes(pickle.dumps(_writer.prepare(number, spec)))
     return str(path)

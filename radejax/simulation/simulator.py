@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import collections
 import dataclasses
-from typing import Literal
+from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Float, UInt32
 
@@ -21,13 +20,9 @@ from radejax.data.kradar.labels import Label, LabelHeader
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.config import SimulationConfig
 from radejax.simulation.radar import propagation, scattering, tensor
+from radejax.simulation.world import scene
 from radejax.simulation.world.replay import make_real_sequence
-from radejax.simulation.world.scene import (
-    FRAME_PERIOD_S,
-    REFLECTOR_KINDS,
-    SceneFrame,
-    Sequence,
-)
+from radejax.simulation.world.scene import SceneFrame, Sequence
 from radejax.simulation.world.traffic import make_sequence
 
 MIN_SNR_DB = 10.0
@@ -55,26 +50,10 @@ class RadarInput:
     snr_db: Float[np.ndarray, " N"]
     lit: Float[np.ndarray, " N"]
 
-
-def simulate_radar(
-    given: RadarInput,
-    grid: RadarGrid,
-    parameters: tensor.RadarParameters,
-    output: Literal["tesseract", "projection"],
-) -> Float[jax.Array, "..."]:
-    """Computes the rows `[R, E, D, A]` of the 4D radar tensor or its projection.
-
-    The projection has the shape `[R, A, D+E]`. The result is a device array, whose
-    computation may not be finished when the function returns.
-    """
-    return tensor.simulate(
-        given.scatterers,
-        given.noise_power,
-        given.key,
-        grid=grid,
-        parameters=parameters,
-        output="rows" if output == "tesseract" else "projection",
-    )
+    @property
+    def arrays(self) -> tuple[Any, ...]:
+        """The arrays from which `tensor.simulate` computes the frame."""
+        return self.scatterers, self.noise_power, self.key
 
 
 class SequenceSimulator:
@@ -123,7 +102,7 @@ class SequenceSimulator:
             parameters.wavelength_m,
         )
         # The cross-section of the ground already includes its reflections.
-        is_ground = frame.reflectors.kind == REFLECTOR_KINDS.index("ground")
+        is_ground = frame.reflectors.kind == scene.REFLECTOR_KINDS.index("ground")
         count = len(objects.power)
         bounce[count : count + len(is_ground)][is_ground] = 1.0
         distance = np.linalg.norm(found.position_m, axis=1)
@@ -146,12 +125,11 @@ class SequenceSimulator:
         )
 
     def run(
-        self,
-        given: RadarInput,
-        output: Literal["tesseract", "projection"] = "projection",
+        self, given: RadarInput, output: tensor.Output = "projection"
     ) -> Float[np.ndarray, "..."]:
         """Computes the 4D radar tensor `[D, R, E, A]` or the projection `[R, A, D+E]`."""
-        rows = np.asarray(simulate_radar(given, self.grid, self.parameters, output))
+        of_radar = {"grid": self.grid, "parameters": self.parameters}
+        rows = np.asarray(tensor.simulate(*given.arrays, **of_radar, output=output))
         is_whole = output == "tesseract"
         return rows.transpose(tensor.TESSERACT_OF_ROWS) if is_whole else rows
 
@@ -237,33 +215,30 @@ class ProceduralSource:
         config = self._config
         rng = np.random.default_rng([config.seed, number, 3])
         radar, camera, long_lidar, others = map(int, rng.integers(1, 42, size=4))
-        split = "train" if self._is_training(number) else "test"
+        split = "train" if number <= config.train_sequences else "test"
         start = _FIRST_TIMESTAMP_S + 1000.0 * number
         return [
             FrameSpec(
                 scene_idx=i,
                 indices=(n + radar, n, n + camera, n + long_lidar, n + others),
-                timestamp_s=start + FRAME_PERIOD_S * i,
+                timestamp_s=start + scene.FRAME_PERIOD_S * i,
                 split=split,
             )
             for i, n in enumerate(range(1, config.frames_per_sequence + 1))
         ]
 
-    def _is_training(self, number: int) -> bool:
-        return number <= self._config.train_sequences
-
     def make(self, number: int) -> Sequence:
         """Creates the scene of the sequence `number`."""
-        environment, time, weather = self.conditions(number)
-        times = self._config.vru_density_scale if self._is_training(number) else 1.0
+        config, (environment, time, weather) = self._config, self.conditions(number)
+        is_training = number <= config.train_sequences
         return make_sequence(
             number,
             environment=environment,
             time=time,
             weather=weather,
-            num_frames=self._config.frames_per_sequence,
-            vru_density_scale=times,
-            rng=np.random.default_rng([self._config.seed, number]),
+            num_frames=config.frames_per_sequence,
+            vru_density_scale=config.vru_density_scale if is_training else 1.0,
+            rng=np.random.default_rng([config.seed, number]),
         )
 
 

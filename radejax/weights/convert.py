@@ -24,19 +24,21 @@ from typing import Any
 
 import flax.traverse_util
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from radejax import models
 from radejax.core.archives import read_safetensors
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike, as_path
-from radejax.models.lifting import ReferencePoints
+from radejax.data.cameras import no_images
 from radejax.weights import torch_file
 
 Rules = Sequence[tuple[str, str | Callable[[re.Match], str]]]
 """Patterns and replacements of `re.sub`, applied in order to paths of Flax variables such as
 "backbone/start/kernel". A path that still contains a slash afterwards is of an unknown module."""
+
+StateDict = Mapping[str, Any]
+"""Tensors of torch by name."""
 
 Shapes = Mapping[str, tuple[int, ...]]
 """Shape of each variable by its path, "params/backbone/start/kernel"."""
@@ -167,16 +169,10 @@ def _torch_axes(path: str, ndim: int) -> tuple[int, ...]:
 def variable_shapes(model: Any) -> dict[str, tuple[int, ...]]:
     """Return the shapes of a detector's variables by path, without creating the variables."""
     bins, channels = model.pad_multiple, model.doppler_bins + model.elevation_bins
-    channels *= model.num_frames
-
-    def array(*shape: int, dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
-        return jax.ShapeDtypeStruct((1, *shape), dtype)
-
-    inputs: list[Any] = [array(bins, bins, channels)]
+    shape = (1, bins, bins, model.num_frames * channels)
+    inputs: list[Any] = [np.zeros(shape, np.float32)]
     if models.has_camera(model):
-        queries = (bins, bins, model.query_grid.num_elevation)
-        points = ReferencePoints(array(*queries, 2), array(*queries, dtype=bool))
-        inputs += [array(*model.image_size, 3, dtype=jnp.uint8), points]
+        inputs += no_images(1, model.image_size)
     return shapes_of(jax.eval_shape(model.init, jax.random.key(0), *inputs))
 
 

@@ -16,14 +16,8 @@ from radejax.core.config import load_config
 from radejax.core.errors import DataError, require
 from radejax.core.files import PathLike
 from radejax.models.dinorade import IMAGE_BACKBONE, DinoRade
-from radejax.weights import dinov3_hf, radenet_torch
-from radejax.weights.convert import (
-    Rules,
-    from_torch,
-    read_state_dict,
-    to_numpy,
-    variable_shapes,
-)
+from radejax.weights import convert, dinov3_hf, radenet_torch
+from radejax.weights.convert import Rules, StateDict
 from radejax.weights.image_backbone import RESNET_RULES
 
 PART = "rad_backbone."
@@ -34,7 +28,7 @@ _UNUSED = r"rad_backbone\.cbam_|fusion\.output_proj\."
 
 
 def load(
-    state_dict_or_path: Mapping[str, Any] | PathLike,
+    state_dict_or_path: StateDict | PathLike,
     *,
     dinov3: PathLike | None = None,
     **model_overrides: Any,
@@ -63,13 +57,13 @@ def load(
         DataError: A file is corrupted, or tensors are missing, unexpected or of another
             shape. The message lists up to 20 of them.
     """
-    tensors, source = read_state_dict(state_dict_or_path, PART)
+    tensors, source = convert.read_state_dict(state_dict_or_path, PART)
     config, variables = read(tensors, source, dinov3, **model_overrides)
     return cast(DinoRade, models.build(config)), variables
 
 
 def read(
-    tensors: Mapping[str, Any],
+    tensors: StateDict,
     source: str,
     dinov3: PathLike | None = None,
     **model_overrides: Any,
@@ -88,22 +82,22 @@ def read(
     if is_resnet:
         # The released code only scales the images of its ResNet to [0, 1].
         config["image"] |= {"kind": "resnet50", "standardize": False}
-        shapes = variable_shapes(models.build(config))
+        shapes = convert.variable_shapes(models.build(config))
     else:
         fields, backbone = _transformer(tensors, source, dinov3)
         config["image"] |= fields
         tensors = {k: v for k, v in tensors.items() if not k.startswith(IMAGE_BACKBONE)}
-        shapes = variable_shapes(models.build(config))
+        shapes = convert.variable_shapes(models.build(config))
         shapes = {k: s for k, s in shapes.items() if f"/{IMAGE_BACKBONE}/" not in k}
     names = rules(config["heads"], is_resnet)
-    variables = from_torch(names, shapes, tensors, source, _UNUSED)
+    variables = convert.from_torch(names, shapes, tensors, source, _UNUSED)
     if backbone is not None:
         variables["params"][IMAGE_BACKBONE] = backbone
     return config, variables
 
 
 def _transformer(
-    tensors: Mapping[str, Any], source: str, dinov3: PathLike | None
+    tensors: StateDict, source: str, dinov3: PathLike | None
 ) -> tuple[dict[str, Any], Mapping[str, Any] | None]:
     """Return fields and parameters of the transformer in the folder, else the checkpoint."""
     if dinov3 is not None:
@@ -120,9 +114,7 @@ def _transformer(
     return dinov3_hf.image_fields(vit), params
 
 
-def infer_fusion(
-    tensors: Mapping[str, Any], overrides: Mapping[str, Any]
-) -> dict[str, Any]:
+def infer_fusion(tensors: StateDict, overrides: StateDict) -> dict[str, Any]:
     """Infer fields of `config.model.fusion` from names and shapes, and apply the overrides."""
     has_weights = any(n.startswith("fusion.weighting_network.") for n in tensors)
     fields = {
@@ -176,7 +168,7 @@ def rules(heads: str, is_resnet: bool) -> Rules:
     return (*image, *_FUSION, *radenet_torch.rules(heads, "rad_"))
 
 
-def without_lora(tensors: Mapping[str, Any]) -> dict[str, Any]:
+def without_lora(tensors: StateDict) -> dict[str, Any]:
     """Merge low-rank adapters (PEFT) into the weights that they adapt: W + B A.
 
     The factor alpha / rank is 1, because both are 16 in the released settings. These settings
@@ -194,8 +186,8 @@ def without_lora(tensors: Mapping[str, Any]) -> dict[str, Any]:
         weight = f"{module}.weight"
         halves = [f"{module}.lora_{half}.default.weight" for half in "BA"]
         try:
-            up, down = (to_numpy(tensors[name]) for name in halves)
-            merged[weight] = to_numpy(merged[weight]) + up @ down
+            up, down = (convert.to_numpy(tensors[name]) for name in halves)
+            merged[weight] = convert.to_numpy(merged[weight]) + up @ down
         except (KeyError, ValueError):
             raise DataError(
                 f"{module}: expected an adapter of two halves and the weight they fit"

@@ -22,7 +22,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import safetensors.numpy
 
@@ -31,7 +30,7 @@ from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import PathLike
 from radejax.models.vit import ViT
 from radejax.weights import convert
-from radejax.weights.convert import Rules, to_numpy
+from radejax.weights.convert import Rules, StateDict, to_numpy
 
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
@@ -118,7 +117,7 @@ _DINOV2: Rules = (  # in Hugging Face, where transformers 5 adds "model." to som
 )
 
 
-def to_hugging_face(tensors: Mapping[str, Any]) -> dict[str, Any]:
+def to_hugging_face(tensors: StateDict) -> dict[str, Any]:
     """Return the tensors of any source under DINOv3's names in Hugging Face."""
     tensors = dict(tensors)
     if "blocks.0.gamma_1" in tensors and not any(n.endswith("_bias") for n in tensors):
@@ -189,10 +188,9 @@ def _read_config(folder: pathlib.Path) -> dict[str, Any]:
         )
     config = files.read_object(folder / CONFIG_FILE)
     name = "architecture" if "architecture" in config else "model_type"
-    is_known = re.fullmatch(_KINDS, str(kind := config.get(name))) is not None
-    require(
-        is_known, f"{folder / CONFIG_FILE}: {name}", kind, "a ViT of DINOv3 or DINOv2"
-    )
+    kind, field = config.get(name), f"{folder / CONFIG_FILE}: {name}"
+    is_known = re.fullmatch(_KINDS, str(kind)) is not None
+    require(is_known, field, kind, "a ViT of DINOv3 or DINOv2")
     return config
 
 
@@ -239,7 +237,7 @@ def model_from_config(config: Mapping[str, Any], sizes: ViT | None = None) -> Vi
     return (sizes or ViT()).clone(**fields)
 
 
-def model_from_tensors(tensors: Mapping[str, Any], source: str) -> ViT:
+def model_from_tensors(tensors: StateDict, source: str) -> ViT:
     """Create the model whose sizes are those of DINOv3 or DINOv2 tensors by name.
 
     Raises:
@@ -282,7 +280,7 @@ def image_fields(model: ViT) -> dict[str, Any]:
 
 
 def to_params(
-    model: ViT, tensors: Mapping[str, Any], source: str = "state dict"
+    model: ViT, tensors: StateDict, source: str = "state dict"
 ) -> dict[str, Any]:
     """Convert DINOv3 tensors by name to the parameters of `model`.
 
@@ -301,9 +299,9 @@ def to_params(
             del tensors[name]  # it has no effect, see `vit.Block`
     # Only used in pretraining, and checked in `model_from_tensors`.
     ignored = rf"(embeddings\.)?mask_token$|local_cls_norm\.|{_PERIODS}$|.*\.bias_mask$"
-    return convert.from_torch(_RULES, _shapes(model), tensors, source, ignored)[
-        "params"
-    ]
+    image = np.zeros((1, model.patch_size, model.patch_size, 3), np.float32)
+    shapes = convert.shapes_of(jax.eval_shape(model.init, jax.random.key(0), image))
+    return convert.from_torch(_RULES, shapes, tensors, source, ignored)["params"]
 
 
 def to_tensors(model: ViT, params: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -318,10 +316,3 @@ def to_tensors(model: ViT, params: Mapping[str, Any]) -> dict[str, np.ndarray]:
         tensors[_REGISTERS] = np.ascontiguousarray(tokens[:, 1:])
     mask = np.zeros((1, 1, model.hidden_size), np.float32)
     return tensors | {"embeddings.mask_token": mask}
-
-
-def _shapes(model: ViT) -> dict[str, tuple[int, ...]]:
-    image = jax.ShapeDtypeStruct(
-        (1, model.patch_size, model.patch_size, 3), jnp.float32
-    )
-    return convert.shapes_of(jax.eval_shape(model.init, jax.random.key(0), image))

@@ -19,15 +19,8 @@ from radejax import models
 from radejax.core.errors import UserError
 from radejax.core.files import PathLike, differences
 from radejax.models.dinorade import IMAGE_BACKBONE
-from radejax.weights import dinov3_hf
-from radejax.weights.convert import (
-    Rules,
-    from_torch,
-    read_state_dict,
-    shapes_of,
-    to_torch,
-    variable_shapes,
-)
+from radejax.weights import convert, dinov3_hf
+from radejax.weights.convert import Rules
 
 
 def load_image_backbone(
@@ -109,7 +102,7 @@ def check_fits(
     model: nn.Module, variables: Mapping[str, Any], source: PathLike
 ) -> None:
     """Raise a `UserError` unless variables fit a model; the backbone may be missing."""
-    wanted, found = variable_shapes(model), shapes_of(variables)
+    wanted, found = convert.variable_shapes(model), convert.shapes_of(variables)
     if IMAGE_BACKBONE not in variables.get("params", {}):
         wanted = {k: s for k, s in wanted.items() if f"/{IMAGE_BACKBONE}/" not in k}
     if lines := differences(found, wanted, ""):
@@ -164,18 +157,18 @@ def load_resnet(
         DataError: The file is corrupted, or tensors are missing, unexpected or of another
             shape. The message lists up to 20 of them.
     """
-    tensors, source = read_state_dict(state_dict_or_path, "layer1.0.")
+    tensors, source = convert.read_state_dict(state_dict_or_path, "layer1.0.")
     has_last = any(name.startswith("layer4.") for name in tensors)
     parts = r"image_backbone/|image_neck/block_" if has_last else r"image_backbone/"
     shapes = {
         path: shape
-        for path, shape in variable_shapes(model).items()
+        for path, shape in convert.variable_shapes(model).items()
         if re.match(rf"\w+/({parts})", path)
     }
-    return from_torch(RESNET_RULES, shapes, tensors, source, r"fc\.")
+    return convert.from_torch(RESNET_RULES, shapes, tensors, source, r"fc\.")
 
 
 def save_resnet(params: Mapping[str, Any], path: PathLike) -> None:
     """Write the parameters of a `ResNetTrunk` to a safetensors file with torchvision's names."""
     trunk = {"params": {"image_backbone": params}}
-    safetensors.numpy.save_file(to_torch(RESNET_RULES, trunk), path)
+    safetensors.numpy.save_file(convert.to_torch(RESNET_RULES, trunk), path)

@@ -13,17 +13,8 @@ from radejax.core.config import load_config
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike
 from radejax.models.radenet import RadeNet
-from radejax.weights.convert import (
-    Rules,
-    from_torch,
-    read_state_dict,
-    to_torch,
-    to_torch_layout,
-    torch_name,
-    variable_shapes,
-)
-
-StateDict = Mapping[str, Any]
+from radejax.weights import convert
+from radejax.weights.convert import Rules, StateDict
 
 PART = "backbone."
 """Start of names by which a RADE-Net state dict is recognized."""
@@ -56,7 +47,7 @@ def load(
         DataError: The file is corrupted, or tensors are missing, unexpected or of another
             shape. The message lists up to 20 of them.
     """
-    tensors, source = read_state_dict(state_dict_or_path, PART)
+    tensors, source = convert.read_state_dict(state_dict_or_path, PART)
     config, variables = read(tensors, source, **model_overrides)
     return cast(RadeNet, models.build(config)), variables
 
@@ -67,9 +58,9 @@ def read(
     """Return `config.model` and variables for tensors by official name; see `load`."""
     config = load_config("radenet:official").model.to_dict()
     config |= infer_config(tensors, source, model_overrides)
-    shapes = variable_shapes(models.build(config))
+    shapes = convert.variable_shapes(models.build(config))
     names = rules(config["heads"])
-    return config, from_torch(names, shapes, tensors, source, _UNUSED_CBAM)
+    return config, convert.from_torch(names, shapes, tensors, source, _UNUSED_CBAM)
 
 
 def save(model: RadeNet, variables: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -103,7 +94,7 @@ def save(model: RadeNet, variables: Mapping[str, Any]) -> dict[str, np.ndarray]:
             f"input_center={model.input_center} and input_scale={model.input_scale}: "
             "train with 0 and 1 to save it for that code"
         )
-    state = to_torch(rules(model.heads), {"params": variables["params"]})
+    state = convert.to_torch(rules(model.heads), {"params": variables["params"]})
     if model.cbam is None:
         for name, shape in torch_shapes(model.clone(cbam="official")).items():
             is_scale = len(shape) == 1 and name.endswith("weight")
@@ -226,6 +217,8 @@ def torch_shapes(model: RadeNet) -> dict[str, tuple[int, ...]]:
     names = rules(model.heads)
     return {
         # A broadcast scalar has the shape without using the memory.
-        torch_name(names, path): to_torch_layout(path, np.broadcast_to(0, shape)).shape
-        for path, shape in variable_shapes(model).items()
+        convert.torch_name(names, path): convert.to_torch_layout(
+            path, np.broadcast_to(0, shape)
+        ).shape
+        for path, shape in convert.variable_shapes(model).items()
     }

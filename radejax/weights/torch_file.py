@@ -71,18 +71,15 @@ def read(path: PathLike) -> Any:
         raise DataError(f"{path}: corrupted torch file ({one_line(error)})") from None
 
 
+Sizes = tuple[int, ...]
+
+
 class _Storage(NamedTuple):
     values: np.ndarray
 
 
 def _rebuild_tensor(
-    storage: _Storage,
-    offset: int,
-    shape: tuple[int, ...],
-    strides: tuple[int, ...],
-    requires_grad: object = None,
-    hooks: object = None,
-    metadata: object = None,
+    storage: _Storage, offset: int, shape: Sizes, strides: Sizes, *unused: object
 ) -> np.ndarray:
     """Return a view of a storage, after checking that it is within the storage."""
     if not isinstance(storage, _Storage) or max(len(shape), len(strides)) > _MAX_DIMS:
@@ -99,9 +96,7 @@ def _rebuild_tensor(
     return np.lib.stride_tricks.as_strided(values[offset:], shape, steps)
 
 
-def _rebuild_parameter(
-    data: np.ndarray, requires_grad: object, hooks: object
-) -> np.ndarray:
+def _rebuild_parameter(data: np.ndarray, *unused: object) -> np.ndarray:
     return data
 
 

@@ -133,7 +133,7 @@ class TestRepeating:
         self, tree, tmp_path, monkeypatch
     ):
         root = tmp_path / "interrupted"
-        write, calls = dataset._write_frame, []
+        write, calls = dataset.Writer.write_frame, []
 
         def stops(*frame):
             if len(calls) == 4:
@@ -141,12 +141,12 @@ class TestRepeating:
             calls.append(frame)
             write(*frame)
 
-        monkeypatch.setattr(dataset, "_write_frame", stops)
+        monkeypatch.setattr(dataset.Writer, "write_frame", stops)
         with pytest.raises(KeyboardInterrupt):
             simulate_dataset(small_config(), root, num_workers=0, progress=False)
         marker = json.loads((root / dataset.SIMULATION_MARKER).read_text())
         assert not marker["finished"]
-        monkeypatch.setattr(dataset, "_write_frame", write)
+        monkeypatch.setattr(dataset.Writer, "write_frame", write)
         # A killed writer leaves its temporary file; a living one's is not touched.
         dead = subprocess.Popen([sys.executable, "-c", ""])
         dead.wait()
@@ -163,21 +163,21 @@ class TestRepeating:
 
     def test_finished_dataset_is_reused_unchanged(self, tree, monkeypatch):
         monkeypatch.setattr(
-            dataset, "_write_frames", lambda *a: pytest.fail("simulated again")
+            dataset.Writer, "write_frames", lambda *a: pytest.fail("simulated again")
         )
         assert simulate_dataset(small_config(), tree, progress=False) == tree
 
 
 class TestWrongUse:
     def test_a_killed_worker_raises_a_user_error(self, tmp_path, monkeypatch):
-        root, write = tmp_path / "data", dataset._write_frame
+        root, write = tmp_path / "data", dataset.Writer.write_frame
 
         def write_and_kill(*frame):
             write(*frame)
             for worker in multiprocessing.active_children():
                 worker.kill()
 
-        monkeypatch.setattr(dataset, "_write_frame", write_and_kill)
+        monkeypatch.setattr(dataset.Writer, "write_frame", write_and_kill)
         with pytest.raises(UserError, match="a worker process ended early"):
             simulate_dataset(small_config(), root, num_workers=1, progress=False)
         assert 1 <= len(list(root.rglob("info_label_v2_1/*.txt"))) < 9

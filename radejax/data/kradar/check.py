@@ -89,13 +89,9 @@ def _with_shares(row: Mapping[str, Any]) -> dict[str, str]:
 def check_dataset(
     roots: PathLike | Iterable[PathLike],
     *,
-    labels: PathLike | None = None,
-    version: str = "v2.1",
-    sequence_numbers: Sequence[int] | None = None,
-    weather: Sequence[str] | None = None,
-    camera_calibration: PathLike | None = None,
     deep: bool = False,
     progress: bool = False,
+    **options: Any,
 ) -> HealthReport:
     """Checks a K-Radar copy and reports its content and its problems.
 
@@ -104,15 +100,11 @@ def check_dataset(
 
     Args:
         roots: Folder or folders that contain the sequences.
-        labels: Folder or zip file of a label revision, or None for the labels in the
-            sequences' own folders.
-        version: Version of the labels.
-        sequence_numbers: Sequences to check, or None for all.
-        weather: Weathers of the sequences to check, or None for all.
-        camera_calibration: Folder of camera calibrations, or None for those in the roots.
         deep: Whether to read and project every radar tensor, which finds all corruption
             and takes hours.
         progress: Whether to show a progress bar.
+        **options: Options of `KRadar`: `labels`, `version`, `camera_calibration`, and the
+            `sequence_numbers` and `weather` of the sequences to check.
 
     Raises:
         FileNotFoundError: A root or `labels` does not exist.
@@ -120,19 +112,12 @@ def check_dataset(
             sequences and weathers, or the labels have another version.
         DataError: The folders or the labels are ambiguous or corrupted as a whole.
     """
-    data = KRadar(
-        roots,
-        labels,
-        version=version,
-        sequence_numbers=sequence_numbers,
-        weather=weather,
-        camera_calibration=camera_calibration,
-    )
+    data = KRadar(roots, **options)
     summary, splits = data.summary(), _find_splits(data)
     groups = itertools.groupby(data, key=lambda frame: frame.sequence)
     frames = {number: list(group) for number, group in groups}
     folders = data.folders
-    if sequence_numbers is not None or weather is not None:
+    if any(options.get(name) is not None for name in ("sequence_numbers", "weather")):
         if not frames:
             raise UserError("no frames of these sequences and weathers")
         folders = {number: folders[number] for number in frames}

@@ -41,6 +41,7 @@ from radejax.data.kradar.conditions import (
 from radejax.data.kradar.labels import (
     LABEL_CLASSES,
     VISIBILITY_FLAGS,
+    Key,
     Label,
     LabelFile,
     LabelHeader,
@@ -58,9 +59,6 @@ T = TypeVar("T")
 
 SIMULATION_MARKER = "simulation.json"
 """File that marks a dataset as simulated and has the settings of the simulator."""
-
-Key = tuple[int, str]
-"""Sequence number and frame name, such as `(1, "00033_00001")`."""
 
 # Regular expressions are used because str.isdecimal also accepts digits of other scripts.
 _SEQUENCE = re.compile(r"[0-9]{1,6}")
@@ -422,9 +420,7 @@ class KRadar(LabelledFrames[Frame]):
         return files
 
     def _make_frames(
-        self,
-        files: Mapping[Key, LabelFile],
-        sequences: Mapping[int, Mapping[str, Any]],
+        self, files: Mapping[Key, LabelFile], sequences: Mapping[int, Mapping[str, Any]]
     ) -> list[Frame]:
         """Builds frames with filtered boxes.
 
@@ -476,8 +472,7 @@ class KRadar(LabelledFrames[Frame]):
         if self._visibility is not None:
             rules["visibility"] = np.isin(flags, list(self._visibility))
         if self._field_of_view:
-            x_m, y_m = boxes[:, 0], boxes[:, 1]
-            rules["field of view"] = self.grid.in_field_of_view(x_m, y_m)
+            rules["field of view"] = self.grid.in_field_of_view(*boxes[:, :2].T)
         for rule, passes in rules.items():
             self.counts[f"objects left out by {rule}"] = int((is_kept & ~passes).sum())
             is_kept &= passes
@@ -714,26 +709,21 @@ def find_labels(path: pathlib.Path) -> dict[Key, LabelPath]:
         UserError: There are no label files in it.
         DataError: It contains a frame twice, or the zip file is corrupted.
     """
-    files: list[tuple[pathlib.PurePath, LabelPath]]
+    files: list[tuple[str, LabelPath]]
     if path.is_dir():
-        files = [(file.relative_to(path), file) for file in find_files(path, "*.txt")]
+        paths = find_files(path, "*.txt")
+        files = [(file.relative_to(path).as_posix(), file) for file in paths]
     else:
         with wrap_read_errors(path, "a folder or a zip file of labels"):
             archive = zipfile.ZipFile(path)  # stays open while its members are used
-        files = [
-            (
-                pathlib.PurePosixPath(name.replace("\\", "/")),
-                zipfile.Path(archive, name),
-            )
-            for name in archive.namelist()
-        ]
+        files = [(name, zipfile.Path(archive, name)) for name in archive.namelist()]
     found: dict[Key, LabelPath] = {}
-    for name, file in files:
-        folders = map(_LABELLED_SEQUENCE.fullmatch, reversed(name.parts[:-1]))
-        sequence = next(filter(None, folders), None)
-        if sequence is None or not _LABEL_NAME.fullmatch(name.name):
-            continue
-        _add_label(found, (int(sequence[1]), frame_key(name.name)), file)
+    for place, file in files:
+        *folders, name = place.replace("\\", "/").split("/")
+        matches = map(_LABELLED_SEQUENCE.fullmatch, reversed(folders))
+        sequence = next(filter(None, matches), None)
+        if sequence is not None and _LABEL_NAME.fullmatch(name):
+            _add_label(found, (int(sequence[1]), frame_key(name)), file)
     if not found:
         raise UserError(
             f"{path}: no label files in it, expected <sequence>/<radar>_<lidar>.txt "

@@ -24,6 +24,9 @@ from radejax.core.archives import wrap_read_errors
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike
 
+Key = tuple[int, str]
+"""Sequence number and frame name, such as `(1, "00033_00001")`."""
+
 LabelPath = pathlib.Path | zipfile.Path
 """A label file, or one in a zip archive."""
 

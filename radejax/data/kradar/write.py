@@ -8,15 +8,14 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import pathlib
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 from jaxtyping import Real
 
-from radejax.core.files import atomic_write, write_text
-from radejax.data.kradar.labels import Label, normalize_version
+from radejax.core.files import PathLike, atomic_write, write_text
+from radejax.data.kradar.labels import Key, Label, normalize_version
 from radejax.geometry.radar_grid import RadarGrid
 
 _SENSORS = "tesseract_os2-64_cam-front_os1-128_cam-lrr"
@@ -24,7 +23,7 @@ _MAT_TEXT = b"MATLAB 5.0 MAT-file, written by radejax"
 
 
 def write_labels(
-    path: str | os.PathLike,
+    path: PathLike,
     indices: Sequence[int],
     timestamp_s: float,
     labels: Iterable[Label],
@@ -52,7 +51,7 @@ def write_labels(
 
 
 def write_calibration(
-    path: str | os.PathLike, frame_difference: int, dx_m: float, dy_m: float
+    path: PathLike, frame_difference: int, dx_m: float, dy_m: float
 ) -> None:
     """Writes `info_calib/calib_radar_lidar.txt`.
 
@@ -67,17 +66,13 @@ def write_calibration(
 
 
 def write_description(
-    path: str | os.PathLike, environment: str, time: str, weather: str
+    path: PathLike, environment: str, time: str, weather: str
 ) -> None:
     """Writes `description.txt` with the conditions of one sequence on one line."""
     write_text(path, f"{environment},{time},{weather}\n")
 
 
-def write_splits(
-    folder: str | os.PathLike,
-    train: Iterable[tuple[int, str]],
-    test: Iterable[tuple[int, str]],
-) -> None:
+def write_splits(folder: PathLike, train: Iterable[Key], test: Iterable[Key]) -> None:
     """Writes `train.txt` and `test.txt` into a folder.
 
     Args:
@@ -91,10 +86,7 @@ def write_splits(
 
 
 def write_tesseract(
-    path: str | os.PathLike,
-    tesseract: Real[np.ndarray, "D R E A"],
-    *,
-    compress: bool = False,
+    path: PathLike, tesseract: Real[np.ndarray, "D R E A"], *, compress: bool = False
 ) -> None:
     """Writes a radar tensor as in K-Radar: MATLAB v5, variable `arrDREA`, column-major.
 
@@ -114,7 +106,7 @@ def write_tesseract(
         file.write(_MAT_TEXT.ljust(116))
 
 
-def write_grid(root: str | os.PathLike, grid: RadarGrid) -> None:
+def write_grid(root: PathLike, grid: RadarGrid) -> None:
     """Writes `radar_grid.json` into the root of a dataset with a sensor grid of its own."""
     write_text(pathlib.Path(root) / "radar_grid.json", json.dumps(grid.to_dict()))
 

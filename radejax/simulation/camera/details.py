@@ -15,6 +15,9 @@ from jaxtyping import Float, Int
 
 from radejax.simulation.world.scene import REFLECTOR_KINDS, SceneFrame
 
+Quads = Float[np.ndarray, "F 4 3"]
+Spans = Float[np.ndarray, "F 2"]
+
 FRONT, REAR, LEFT, RIGHT, TOP = range(5)
 """Indices of the faces of a block, in the order of `shapes`."""
 
@@ -127,11 +130,7 @@ DETAILS: dict[str, tuple[Detail, ...]] = {
 }
 
 
-def on_faces(
-    faces: Float[np.ndarray, "F 4 3"],
-    u: Float[np.ndarray, "F 2"],
-    v: Float[np.ndarray, "F 2"],
-) -> Float[np.ndarray, "F 4 3"]:
+def on_faces(faces: Quads, u: Spans, v: Spans) -> Quads:
     """Computes the corners of rectangles on quadrilateral faces.
 
     Args:
@@ -166,7 +165,7 @@ class Faces(NamedTuple):
         box: Index of the box, -1 for none.
     """
 
-    corners: Float[np.ndarray, "F 4 3"]
+    corners: Quads
     color: Float[np.ndarray, "F 3"]
     depth_m: Float[np.ndarray, " F"]
     block_depth_m: Float[np.ndarray, " F"]

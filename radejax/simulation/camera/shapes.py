@@ -9,12 +9,15 @@ from jaxtyping import Float, Int
 
 from radejax.geometry.camera import CameraCalibration, project
 from radejax.simulation.camera import details
-from radejax.simulation.camera.details import Faces
+from radejax.simulation.camera.details import Faces, Quads
 
 # A block in units of the half extents: x, y and z range, color role, and the taper, which is
 # the fraction of length and width at its top.
 _Pair = tuple[float, float]
 _Block = tuple[_Pair, _Pair, _Pair, str, _Pair]
+
+Colors = Float[np.ndarray, "N 3"]
+Lengths = Float[np.ndarray, " N"]
 
 _STRAIGHT = (1.0, 1.0)
 BLOCKS: dict[str, tuple[_Block, ...]] = {
@@ -132,12 +135,8 @@ class Light:
     headlights: bool
 
     def apply(
-        self,
-        color: Float[np.ndarray, "N 3"],
-        x_m: Float[np.ndarray, " N"],
-        y_m: Float[np.ndarray, " N"],
-        depth_m: Float[np.ndarray, " N"],
-    ) -> Float[np.ndarray, "N 3"]:
+        self, color: Colors, x_m: Lengths, y_m: Lengths, depth_m: Lengths
+    ) -> Colors:
         """Computes the apparent colors of surfaces from their colors and positions."""
         brightness = np.full(np.shape(depth_m), self.ambient)
         if self.headlights:
@@ -224,9 +223,7 @@ def _object_faces(boxes, classes, colors, origin) -> Faces:
     return Faces(*(column[shown] for column in faces))
 
 
-def _project_faces(
-    faces: Float[np.ndarray, "F 4 3"], calibration: CameraCalibration
-) -> list[list[float]]:
+def _project_faces(faces: Quads, calibration: CameraCalibration) -> list[list[float]]:
     """Projects faces to flat lists of pixels, clipped at the near plane.
 
     Edges are subdivided to follow the lens distortion. A face that is entirely nearer

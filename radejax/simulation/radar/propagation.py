@@ -41,6 +41,8 @@ from jaxtyping import Complex, Float, Inexact
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.radar.tensor import RadarParameters
 
+Cells = Float[np.ndarray, "*cells"]
+
 
 @dataclasses.dataclass(frozen=True)
 class Surface:
@@ -93,9 +95,7 @@ WEATHERS = {
 """K-Radar's seven weathers."""
 
 
-def attenuation(
-    weather: str, distance_m: Float[np.ndarray, "*cells"]
-) -> Float[np.ndarray, "*cells"]:
+def attenuation(weather: str, distance_m: Cells) -> Cells:
     """Computes the factor on the received power by two-way attenuation and radome loss."""
     law = WEATHERS[weather]
     loss_db = 2.0 * law.attenuation_db_per_km * distance_m / 1000.0 + law.radome_db
@@ -141,9 +141,7 @@ def noise_profile(
 
 
 def reflection(
-    sine: float | Float[np.ndarray, "*targets"],
-    surface: Surface,
-    wavelength_m: float,
+    sine: float | Float[np.ndarray, "*targets"], surface: Surface, wavelength_m: float
 ) -> Inexact[Any, "*targets"]:
     """Computes the complex reflection coefficient of the coherent field.
 

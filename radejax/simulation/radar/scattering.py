@@ -29,15 +29,16 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
+from numpy.random import Generator
 
 from radejax.core.structures import CLASSES
 from radejax.simulation.radar.tensor import RadarParameters, Scatterers
-from radejax.simulation.world.scene import (
-    FRAME_PERIOD_S,
-    SceneFrame,
-    is_blocked,
-    rotate,
-)
+from radejax.simulation.world import scene
+from radejax.simulation.world.scene import SceneFrame
+
+Vectors = Float[np.ndarray, "S 3"]
+Values = Float[np.ndarray, " S"]
+Indices = Int[np.ndarray, " S"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,20 +95,18 @@ class ObjectScatterers(NamedTuple):
         micro_phase_rad: Phase of the velocity swing at time 0.
     """
 
-    track: Int[np.ndarray, " S"]
-    position: Float[np.ndarray, "S 3"]
-    normal: Float[np.ndarray, "S 3"]
-    power_m2: Float[np.ndarray, " S"]
-    glint: Float[np.ndarray, " S"]
-    phase_rad: Float[np.ndarray, " S"]
-    micro: Float[np.ndarray, " S"]
-    micro_phase_rad: Float[np.ndarray, " S"]
+    track: Indices
+    position: Vectors
+    normal: Vectors
+    power_m2: Values
+    glint: Values
+    phase_rad: Values
+    micro: Values
+    micro_phase_rad: Values
 
 
 def make_object_scatterers(
-    cls: Int[np.ndarray, " N"],
-    size_m: Float[np.ndarray, "N 3"],
-    rng: np.random.Generator,
+    cls: Int[np.ndarray, " N"], size_m: Float[np.ndarray, "N 3"], rng: Generator
 ) -> ObjectScatterers:
     """Draws the scattering centers of objects.
 
@@ -130,7 +129,7 @@ def make_object_scatterers(
 
 
 def _one_object(
-    index: int, cls: str, size_m: Float[np.ndarray, "3"], rng: np.random.Generator
+    index: int, cls: str, size_m: Float[np.ndarray, "3"], rng: Generator
 ) -> ObjectScatterers:
     """Draws the scattering centers of one object."""
     law = CLASS_SCATTERING[cls]
@@ -206,11 +205,11 @@ class FrameScattering(NamedTuple):
         owner: Index of the box in the frame, -1 for surroundings and ghosts.
     """
 
-    position_m: Float[np.ndarray, "S 3"]
+    position_m: Vectors
     velocity_mps: Float[np.ndarray, "S 2"]
-    power: Float[np.ndarray, " S"]
-    phase_rad: Float[np.ndarray, " S"]
-    owner: Int[np.ndarray, " S"]
+    power: Values
+    phase_rad: Values
+    owner: Indices
 
 
 def scatter_objects(
@@ -228,15 +227,15 @@ def scatter_objects(
     owner = owner_of_track[centers.track[used]]
     box = boxes[owner]  # [S, 7]
 
-    def turn(v: Float[np.ndarray, "S 3"]) -> Float[np.ndarray, "S 3"]:
-        return np.stack([*rotate(v[:, 0], v[:, 1], box[:, 6]), v[:, 2]], 1)
+    def turn(v: Vectors) -> Vectors:
+        return np.stack([*scene.rotate(v[:, 0], v[:, 1], box[:, 6]), v[:, 2]], 1)
 
     position = box[:, :3] + turn(centers.position[used] * box[:, 3:6] / 2.0)
     normal = turn(centers.normal[used])
     distance = np.linalg.norm(position, axis=1)
     cosine = -(normal * position).sum(1) / np.maximum(distance, 1e-6)
     rcs = centers.power_m2[used] * face_gain(cosine, centers.glint[used])
-    blocked = is_blocked(position, boxes, owner)
+    blocked = scene.is_blocked(position, boxes, owner)
     power = received_power(position, rcs, parameters)
     lit = np.bincount(owner, power * ~blocked, len(boxes))
     total = np.bincount(owner, power, len(boxes))
@@ -247,7 +246,7 @@ def scatter_objects(
     is_walking = frame.cls[owner] == CLASSES.index("Pedestrian")
     turning = np.where(is_walking, 1.8, speed / 0.33)
     swing = centers.micro[used] * np.sin(
-        turning * (frame.index * FRAME_PERIOD_S) + centers.micro_phase_rad[used]
+        turning * (frame.index * scene.FRAME_PERIOD_S) + centers.micro_phase_rad[used]
     )
     velocity = frame.velocity_mps[owner] * (1.0 + swing[:, None])
     scattering = FrameScattering(
@@ -257,10 +256,8 @@ def scatter_objects(
 
 
 def received_power(
-    position_m: Float[np.ndarray, "S 3"],
-    rcs_m2: Float[np.ndarray, " S"],
-    parameters: RadarParameters,
-) -> Float[np.ndarray, " S"]:
+    position_m: Vectors, rcs_m2: Values, parameters: RadarParameters
+) -> Values:
     """Computes linear power by the radar equation, gain x cross-section x pattern / R^4."""
     distance = np.maximum(np.linalg.norm(position_m, axis=1), 1.0)
     forward = np.clip(position_m[:, 0] / distance, 0.0, 1.0)
@@ -311,9 +308,7 @@ def to_scatterers(
 
 
 def scatter_surroundings(
-    frame: SceneFrame,
-    phase_rad: Float[np.ndarray, " M"],
-    parameters: RadarParameters,
+    frame: SceneFrame, phase_rad: Float[np.ndarray, " M"], parameters: RadarParameters
 ) -> FrameScattering:
     """Computes the scatterers of ground, guard rails, walls, poles and trees.
 
@@ -329,7 +324,7 @@ def scatter_surroundings(
     gain = np.where(np.isnan(fixed.normal_rad), 1.0, face_gain(np.abs(cosine), 4.0))
     power = received_power(position, 10.0 ** (fixed.rcs_dbsm / 10.0) * gain, parameters)
     owner = np.full(len(position), -1)
-    blocked = is_blocked(position, frame.boxes, owner)
+    blocked = scene.is_blocked(position, frame.boxes, owner)
     power = np.where(blocked, power * 10.0 ** (OCCLUDED_DB / 10.0), power)
     return FrameScattering(
         position,

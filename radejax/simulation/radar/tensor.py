@@ -27,6 +27,10 @@ from radejax.core.structures import Array
 from radejax.data.projection import LOG_OFFSET_DB, LOG_SCALE_DB, POWER_FLOOR
 from radejax.geometry.radar_grid import RadarGrid
 
+PerTarget = Float[Array, " S"]
+Bits = UInt32[jax.Array, "*all"]
+Output = Literal["tesseract", "projection"]
+
 TESSERACT_OF_ROWS = (2, 0, 1, 3)
 """Permutation of the axes from rows `[R, E, D, A]` to a tesseract `[D, R, E, A]`."""
 
@@ -97,10 +101,10 @@ class Scatterers(struct.PyTreeNode):
     """
 
     # Leaves are not checked, because JAX also rebuilds pytrees with shapes, specs or None.
-    range_m: Float[Array, " S"]
-    azimuth_rad: Float[Array, " S"]
-    elevation_rad: Float[Array, " S"]
-    velocity_mps: Float[Array, " S"]
+    range_m: PerTarget
+    azimuth_rad: PerTarget
+    elevation_rad: PerTarget
+    velocity_mps: PerTarget
     amplitude: Float[Array, "S 2"]
 
 
@@ -140,7 +144,7 @@ def window_response(
 
 
 def doppler_response(
-    velocity_mps: Float[Array, " S"], grid: RadarGrid
+    velocity_mps: PerTarget, grid: RadarGrid
 ) -> Float[jax.Array, "D S"]:
     """Computes amplitudes on the Doppler axis, where velocities alias by its period.
 
@@ -155,7 +159,7 @@ def doppler_response(
 
 
 def range_response(
-    range_m: Float[Array, " S"], grid: RadarGrid, parameters: RadarParameters
+    range_m: PerTarget, grid: RadarGrid, parameters: RadarParameters
 ) -> Float[jax.Array, "R S"]:
     """Computes amplitudes on the range axis."""
     resolution = parameters.range_resolution_m or grid.range_widths_m
@@ -172,7 +176,7 @@ def simulate(
     *,
     grid: RadarGrid,
     parameters: RadarParameters = RadarParameters(),
-    output: Literal["rows", "projection"] = "projection",
+    output: Output = "projection",
 ) -> Float[jax.Array, "..."]:
     """Simulates one radar frame. The function is jitted and supports `jax.vmap`.
 
@@ -184,8 +188,8 @@ def simulate(
         grid: Axes of the tensor.
         parameters: Parameters of the sensor. One without elevation sees with a single beam
             at elevation 0.
-        output: "rows" for the tensor in linear power as `[R, E, D, A]`, the order in
-            which it is computed (see `TESSERACT_OF_ROWS`), or "projection" for its
+        output: "tesseract" for the rows `[R, E, D, A]` of the tensor in linear power, the
+            order in which it is computed (see `TESSERACT_OF_ROWS`), or "projection" for its
             normalized projections `[R, A, D+E]`, with the same values as those of
             `radejax.data.projection`.
 
@@ -256,7 +260,7 @@ def array_basis(
 
 
 def array_signal(
-    angle_rad: Float[Array, " S"], elements: float, pedestal: float
+    angle_rad: PerTarget, elements: float, pedestal: float
 ) -> Float[jax.Array, "N S"]:
     """Returns the signals of point targets at the inputs of `array_basis`.
 
@@ -339,7 +343,7 @@ def _white_noise(
     return jnp.sqrt(-jnp.log(uniform)) * _sine_of_turn(bits + quarter)
 
 
-def _sine_of_turn(bits: UInt32[jax.Array, "*all"]) -> Float[jax.Array, "*all"]:
+def _sine_of_turn(bits: Bits) -> Float[jax.Array, "*all"]:
     """Approximates the sine of an angle given in 1/4096 turns by the 12 lowest bits.
 
     The approximation by two parabolas has an error of at most 0.1 %, which is sufficient
@@ -350,9 +354,7 @@ def _sine_of_turn(bits: UInt32[jax.Array, "*all"]) -> Float[jax.Array, "*all"]:
     return rough * (0.775 + 0.225 * jnp.abs(rough))
 
 
-def _hash(
-    x: UInt32[jax.Array, "*all"], key: UInt32[Array, ""]
-) -> UInt32[jax.Array, "*all"]:
+def _hash(x: Bits, key: UInt32[Array, ""]) -> Bits:
     """Computes a keyed 32-bit integer hash by multiplications and xor-shifts.
 
     The hash is much cheaper than threefry and gives the same bits on every platform. The

@@ -14,21 +14,8 @@ import numpy as np
 from jaxtyping import Float
 
 from radejax.data.kradar import Frame
-from radejax.simulation.world.environments import (
-    ENVIRONMENTS,
-    GROUND_M,
-    SIGHT_M,
-    Environment,
-    make_surroundings,
-)
-from radejax.simulation.world.scene import (
-    FRAME_PERIOD_S,
-    Road,
-    Sequence,
-    Tracks,
-    class_index,
-    traveled,
-)
+from radejax.simulation.world import environments, scene
+from radejax.simulation.world.scene import Road, Sequence, Tracks
 
 MAX_SPEED_MPS = 60.0
 """Relative speed above which motion is assumed to be a swap of track identities."""
@@ -54,14 +41,14 @@ def make_real_sequence(
     clock = np.array([f.header.timestamp_s for f in frames])
     relative = relative_velocity(tracks, clock)
     environment = frames[0].environment
-    law = ENVIRONMENTS.get(environment, ENVIRONMENTS["urban"])
+    law = environments.ENVIRONMENTS.get(environment, environments.ENVIRONMENTS["urban"])
     speed = infer_ego_speed(tracks, relative, law.speed_mps)
-    periods = np.diff(clock, append=clock[-1] + FRAME_PERIOD_S).clip(0.02, 1.0)
-    along = traveled(speed, periods)
+    periods = np.diff(clock, append=clock[-1] + scene.FRAME_PERIOD_S).clip(0.02, 1.0)
+    along = scene.traveled(speed, periods)
     ground = _ground_height(tracks)
     edges = _road_edges(tracks, law)
-    reflectors, mirrors = make_surroundings(
-        law, Road(), along[-1] + SIGHT_M, edges, rng, ground
+    reflectors, mirrors = environments.make_surroundings(
+        law, Road(), along[-1] + environments.SIGHT_M, edges, rng, ground
     )
     # The road is straight along x, so the labels' frame only moves along x.
     world = tracks.position_m + along[:, None, None] * (1.0, 0.0, 0.0)
@@ -114,7 +101,7 @@ def collect_tracks(
         velocity_mps=np.zeros((count, total, 2)),
         is_present=present,
         size_m=boxes[..., 3:6],
-        cls=np.array([class_index(key[0]) for key in columns], int),
+        cls=np.array([scene.class_index(key[0]) for key in columns], int),
         track_id=np.array([key[1] for key in columns], int),
         label_cls=tuple(key[0] for key in columns),
     )
@@ -191,11 +178,11 @@ def _ground_height(tracks: Tracks) -> float:
         np.hypot(tracks.position_m[..., 0], tracks.position_m[..., 1]) < 30.0
     )
     if not near.any():
-        return GROUND_M
+        return environments.GROUND_M
     return float(np.clip(np.median(bottom[near]), -1.4, -0.4))
 
 
-def _road_edges(tracks: Tracks, law: Environment) -> tuple[float, float]:
+def _road_edges(tracks: Tracks, law: environments.Environment) -> tuple[float, float]:
     """Returns the right and left edge of the road, including the labeled objects near it."""
     left = tracks.position_m[..., 1][tracks.is_present]
     left = left[np.abs(left) < 18.0]

@@ -20,6 +20,9 @@ from radejax.core.structures import CLASSES
 FRAME_PERIOD_S = 0.1
 """Time between two frames: K-Radar records 10 frames per second."""
 
+PerFrame = Float[np.ndarray, " F"]
+Points = Float[np.ndarray, "N 3"]
+
 
 @dataclasses.dataclass(frozen=True)
 class Road:
@@ -143,8 +146,8 @@ class Sequence:
     environment: str
     time: str
     weather: str
-    ego_along_m: Float[np.ndarray, " F"]
-    ego_speed_mps: Float[np.ndarray, " F"]
+    ego_along_m: PerFrame
+    ego_speed_mps: PerFrame
     tracks: Tracks
     reflectors: Reflectors
     road: Road
@@ -192,9 +195,8 @@ class Sequence:
 
 
 def traveled(
-    speed_mps: Float[np.ndarray, " F"],
-    period_s: float | Float[np.ndarray, " F"] = FRAME_PERIOD_S,
-) -> Float[np.ndarray, " F"]:
+    speed_mps: PerFrame, period_s: float | PerFrame = FRAME_PERIOD_S
+) -> PerFrame:
     """Returns the distance since the first frame if each speed is held for one period."""
     return np.concatenate([[0.0], np.cumsum((speed_mps * period_s)[:-1])])
 
@@ -246,9 +248,7 @@ def rotate(x: Any, y: Any, angle_rad: Any) -> tuple[Any, Any]:
     return cos * x - sin * y, sin * x + cos * y
 
 
-def _to_ego(
-    points: Float[np.ndarray, "N 3"], pose: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "N 3"]:
+def _to_ego(points: Points, pose: Float[np.ndarray, "3"]) -> Points:
     """Transforms world points to the frame of the radar at `pose` (x, y, heading)."""
     x, y, z = points.T
     return np.stack([*rotate(x - pose[0], y - pose[1], -pose[2]), z], 1)

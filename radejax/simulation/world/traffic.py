@@ -11,21 +11,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from radejax.simulation.world.environments import (
-    ENVIRONMENTS,
-    GROUND_M,
-    SIGHT_M,
-    Environment,
-    make_surroundings,
-)
-from radejax.simulation.world.scene import (
-    FRAME_PERIOD_S,
-    Road,
-    Sequence,
-    Tracks,
-    class_index,
-    traveled,
-)
+from radejax.simulation.world import environments, scene
+from radejax.simulation.world.scene import Road, Sequence, Tracks
 
 # Mean and standard deviation of length, width and height in meters.
 SIZES = {
@@ -59,17 +46,17 @@ def make_sequence(
         vru_density_scale: Factor on the environment's number of pedestrians, motorcycles
             and bicycles.
     """
-    law = ENVIRONMENTS[environment].with_vulnerable(vru_density_scale)
+    law = environments.ENVIRONMENTS[environment].with_vulnerable(vru_density_scale)
     road = Road(float(rng.uniform(-1.0, 1.0) * law.max_curvature))
-    clock = np.arange(num_frames) * FRAME_PERIOD_S
+    clock = np.arange(num_frames) * scene.FRAME_PERIOD_S
     mean_speed = rng.uniform(*law.speed_mps)
     waves = clock / rng.uniform(8.0, 25.0) + rng.random()  # the speed varies slowly
     speed = mean_speed * (1.0 + 0.12 * np.sin(2 * np.pi * waves))
-    along = traveled(speed)
+    along = scene.traveled(speed)
     traffic = _Traffic(law, road, clock, along, speed, rng)
     edges = traffic.fill()
-    reflectors, mirrors = make_surroundings(
-        law, road, along[-1] + SIGHT_M, edges, rng, GROUND_M
+    reflectors, mirrors = environments.make_surroundings(
+        law, road, along[-1] + environments.SIGHT_M, edges, rng, environments.GROUND_M
     )
     return Sequence(
         name=name,
@@ -82,7 +69,7 @@ def make_sequence(
         reflectors=reflectors,
         road=road,
         lanes_m=traffic.lane_borders,
-        ground_m=GROUND_M,
+        ground_m=environments.GROUND_M,
         mirrors_m=mirrors,
     )
 
@@ -91,7 +78,7 @@ def make_sequence(
 class _Traffic:
     """Collects the objects of one sequence, each as a path along the road."""
 
-    law: Environment
+    law: environments.Environment
     road: Road
     clock: Float[np.ndarray, " F"]
     ego_along: Float[np.ndarray, " F"]
@@ -153,10 +140,10 @@ class _Traffic:
     def _lane(self, left_m, speed, direction, *, is_ego_lane=False) -> None:
         """Adds the vehicles of one lane, with constant distances between them."""
         rng = self.rng
-        way = traveled(speed) * direction
+        way = scene.traveled(speed) * direction
         relative = way - self.ego_along
         along = -30.0 - max(relative.max(), 0.0) + rng.uniform(0.0, 20.0)
-        last = SIGHT_M - min(relative.min(), 0.0)
+        last = environments.SIGHT_M - min(relative.min(), 0.0)
         while along < last:
             cls = self._vehicle_class()
             size = self._size(cls)
@@ -174,7 +161,7 @@ class _Traffic:
         """Adds parked vehicles along one edge of the road."""
         rng = self.rng
         along = rng.uniform(-20.0, 0.0)
-        while along < self.ego_along[-1] + SIGHT_M:
+        while along < self.ego_along[-1] + environments.SIGHT_M:
             cls = "Bus or Truck" if rng.random() < 0.1 else "Sedan"
             size = self._size(cls)
             if self.law.perpendicular:
@@ -230,14 +217,15 @@ class _Traffic:
         along, left, speed = (np.stack(v, 1) for v in path)  # [F, N]
         x, y, heading = self.road.position(along, left)
         yaw = heading + np.array(turn)[None]
-        z = np.broadcast_to(GROUND_M + size[:, 2] / 2.0, x.shape)
+        distance = np.abs(along - self.ego_along[:, None])
+        z = np.broadcast_to(environments.GROUND_M + size[:, 2] / 2.0, x.shape)
         return Tracks(
             position_m=np.stack([x, y, z], -1),
             yaw_rad=yaw,
             velocity_mps=np.stack([speed * np.cos(yaw), speed * np.sin(yaw)], -1),
-            is_present=np.abs(along - self.ego_along[:, None]) < SIGHT_M + 20.0,
+            is_present=distance < environments.SIGHT_M + 20.0,
             size_m=np.broadcast_to(size, (len(x), *size.shape)),
-            cls=np.array([class_index(c) for c in cls]),
+            cls=np.array([scene.class_index(c) for c in cls]),
             track_id=np.arange(1, len(paths) + 1),
             label_cls=cls,
         )

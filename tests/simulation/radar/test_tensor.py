@@ -40,7 +40,7 @@ def tesseract(scatterers, *, noise=QUIET, grid=GRID, seed=(1,), **kwargs):
             noise,
             tensor.frame_key(*seed),
             grid=grid,
-            output="rows",
+            output="tesseract",
             **kwargs,
         ),
         np.float64,
