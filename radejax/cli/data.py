@@ -207,7 +207,7 @@ def reduce(roots: tuple[str, ...], out: pathlib.Path, **options: Any) -> None:
 )
 @click.option(
     "--threshold-db",
-    type=entry.NUMBER,
+    type=entry.DECIBELS,
     default=9.0,
     help="Power above the mean of the neighborhood (cfar only).",
 )

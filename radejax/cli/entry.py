@@ -194,7 +194,8 @@ class _Number(click.FloatRange):
 
 COUNT = click.IntRange(1)
 FRACTION = _Number(0, 1)
-NUMBER = _Number()
+METERS = _Number(-100, 100)
+DECIBELS = _Number(0, 100)
 FILE = click.Path(path_type=pathlib.Path, dir_okay=False)
 FOLDER = click.Path(path_type=pathlib.Path, file_okay=False)
 EXISTING = click.Path(exists=True)

@@ -91,7 +91,7 @@ _PREDICTIONS = together(
     click.option(
         "--z-offset",
         "z_offset_m",
-        type=entry.NUMBER,
+        type=entry.METERS,
         help="Meters to add to the z of predictions.",
     ),
     click.option(
@@ -156,7 +156,10 @@ def evaluate(
 
 @click.command(cls=entry.Command)
 @click.argument("predictions", type=entry.EXISTING)
-@click.option("--out", help="Output folder. Default: next to the predictions.")
+@click.option(
+    "--out",
+    help="Output folder. Default: next to the predictions, named after the options.",
+)
 @click.option("--name", help="Name of the run in tables.")
 @_DATA
 @_PREDICTIONS
@@ -177,10 +180,15 @@ def score(
     Example: radejax score found.json --data /data/kradar --out results
     """
     from radejax.evaluation.files import evaluate_files
+    from radejax.evaluation.results import name_of_changes
 
-    path = pathlib.Path(predictions)
-    folder = out or path.with_name(f"{path.stem}_evaluation")
-    source, settings = _settings(path, _given(options), bootstrap=200)
+    path, given = pathlib.Path(predictions), _given(options)
+    source, settings = _settings(path, given, bootstrap=200)
+    usual = {"split": "test"} | vars(_settings(path, {}, bootstrap=200)[1])
+    names = [*usual, "sequences", "weather"]
+    changes = {name: given[name] for name in names if name in given}
+    end = f"_evaluation{name_of_changes(changes, usual)}"
+    folder = out or path.with_name(f"{path.stem}{end}")
     report = evaluate_files(path, folder, source, settings, run=name or path.stem)
     entry.echo_result(as_json, report.metrics, f"{report.text}\nWritten to {folder}")
 

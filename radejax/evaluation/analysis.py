@@ -286,7 +286,9 @@ def _constant_offset(data: EvaluationSet) -> list[str]:
     if not is_constant.any():
         return []
     x, y, z = (f"{value:+.2f}" for value in median)
-    hint = f"; --z-offset {-median[2]:.2f} moves them" if is_constant[2] else ""
+    hint = ""
+    if is_constant[2]:
+        hint = f"; --z-offset {-median[2]:.2f} of `radejax score` moves them"
     return [
         f"predictions lie ({x}, {y}, {z}) m from their objects (x, y, z; median of "
         f"{has.sum()}); boxes are in the radar frame, which is K-Radar's "

@@ -37,6 +37,7 @@ from radejax.evaluation.results import (
     LEVEL,
     EvaluationOptions,
     condition_masks,
+    in_one_sequence,
     interval,
     make_set,
     resample,
@@ -45,6 +46,8 @@ from radejax.evaluation.results import (
 
 MIN_SEEDS = 3
 """Number of seeds that both runs need for a test of their difference."""
+
+_VERDICTS = {True: "significant", False: "not significant", None: "not tested"}
 
 Aps = Float[np.ndarray, "_ _"]
 
@@ -68,15 +71,18 @@ class Comparison:
         ap_b: AP of run B in the same way.
         difference: AP of run B minus AP of run A.
         std: Standard deviation of the difference over seeds; NaN if it is not tested.
-        low: Lower end of the 95 % interval of the difference; NaN with a single sequence.
+        low: Lower end of the 95 % interval of the difference; NaN if the objects of the
+            class are in a single sequence.
         high: Upper end of this interval.
         p_value: Two-sided p-value. If the difference is not tested, it is computed from
             the fraction of resamples in which the difference has the less frequent sign.
-        p_adjusted: p-value after Holm's correction over all rows of the same kind; for
+            NaN without an interval.
+        p_adjusted: p-value after Holm's correction over all rows of the same kind that
+            have one; for
             weathers and distances not below the smallest one over all frames, so that
             equal runs differ in any row with a probability of at most 5 %.
         is_significant: Whether `p_adjusted` is below 0.05; None if the difference is not
-            tested, because a run has fewer than `MIN_SEEDS` seeds.
+            tested, because a run has fewer than `MIN_SEEDS` seeds or there is no interval.
     """
 
     kind: str
@@ -144,6 +150,7 @@ def compare(
         for protocol, space in itertools.product(names, spaces):
             metric, terms = (protocol, space, iou), options.settings_of(protocol)
             aps = np.stack([resample(x, weights, *metric, **terms) for x in chosen])
+            aps[:, 1:, in_one_sequence(chosen[0], of_frame)] = np.nan
             shown = space, iou, protocol, terms["score_threshold"]
             # With a single class, the mean would be the same row again.
             for index, cls in enumerate((*classes, "mean")[: len(classes) ** 2]):
@@ -156,9 +163,9 @@ def compare(
     for _, of_kind in itertools.groupby(rows, lambda row: row.kind):
         group = list(of_kind)
         found = np.maximum(_holm([row.p_value for row in group]), least).tolist()
-        least = least or min(found)  # of all frames, which are the first group
+        least = least or np.nanmin(found, initial=1)  # of all frames, the first group
         for row, p in zip(group, found, strict=True):
-            verdict = p < 1 - LEVEL if is_tested else None
+            verdict = p < 1 - LEVEL if is_tested and not np.isnan(p) else None
             row = dataclasses.replace(row, p_adjusted=p, is_significant=verdict)
             adjusted.append(row)
     return adjusted
@@ -177,7 +184,9 @@ def _difference(a: Aps, b: Aps, is_paired: bool, num_sequences: int) -> tuple[An
     gaps = b.mean(axis=0) - a.mean(axis=0)
     aps = float(a[:, 0].mean()), float(b[:, 0].mean()), float(gaps[0])
     gaps, count = gaps[1:][~np.isnan(gaps[1:])], min(len(a), len(b))
-    if count < MIN_SEEDS or not gaps.size:
+    if not gaps.size:
+        return *aps, *np.full(4, np.nan).tolist()
+    if count < MIN_SEEDS:
         # One is added so that no finite number of resamples gives a p-value of 0.
         turned = min((gaps <= 0).sum(), (gaps >= 0).sum()) + 1
         p_value = float(min(1.0, 2 * turned / (gaps.size + 1)))
@@ -200,9 +209,12 @@ def _difference(a: Aps, b: Aps, is_paired: bool, num_sequences: int) -> tuple[An
 
 
 def _holm(p_values: Sequence[float]) -> list[float]:
-    """Adjusts p-values for their number with Holm's step-down method."""
-    order = np.argsort(p_values, kind="stable")
-    counts = np.arange(len(p_values), 0, -1)
+    """Adjusts p-values for their number with Holm's step-down method.
+
+    NaN stays NaN and does not count.
+    """
+    order = np.argsort(p_values, kind="stable")  # NaN is last
+    counts = np.count_nonzero(~np.isnan(p_values)) - np.arange(len(p_values))
     scaled = np.minimum(1, counts * np.asarray(p_values)[order])
     adjusted = np.empty_like(scaled)
     adjusted[order] = np.maximum.accumulate(scaled)
@@ -233,7 +245,7 @@ def comparison_tables(
         run_b: Name of run B.
         seeds: Numbers of seeds of both runs.
     """
-    is_tested = rows[0].is_significant is not None
+    is_tested = any(row.is_significant is not None for row in rows)
     note = "over sequences; the variation between trainings is not counted"
     if is_tested:
         counts = " and ".join(map(str, dict.fromkeys(seeds)))
@@ -253,9 +265,10 @@ def comparison_tables(
             verdict = []
             if is_tested:
                 gap += f" ± {report.number(row.std)}"
-                verdict = ["significant" if row.is_significant else "not significant"]
+                verdict = [_VERDICTS[row.is_significant]]
             aps = report.numbers((row.ap_a, row.ap_b))
-            values = [*aps, gap, f"[{low}, {high}]", f"{row.p_adjusted:.3f}", *verdict]
+            p_value = "-" if np.isnan(row.p_adjusted) else f"{row.p_adjusted:.3f}"
+            values = [*aps, gap, f"[{low}, {high}]", p_value, *verdict]
             body.append([row.condition, row.cls, protocol, metric, *values])
         by = "all frames" if kind == "all" else f"by {kind}"
         title = f"B = {run_b} against A = {run_a}, {by}: {note}"

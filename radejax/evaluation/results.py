@@ -9,7 +9,7 @@ often as its sequence was drawn, which all protocols handle exactly.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -146,6 +146,27 @@ class EvaluationOptions:
         return {"score_threshold": threshold, "empty_frames": self.empty_frames}
 
 
+SAME_NUMBERS = (
+    *("bootstrap", "batch_size", "num_visualizations", "figures", "plots", "kitti"),
+)
+"""Options of an evaluation that do not change its APs."""
+
+
+def name_of_changes(changes: Mapping[str, Any], usual: Mapping[str, Any]) -> str:
+    """Returns the end of a folder's name for options that change APs: `_roi_wide`.
+
+    Args:
+        changes: Options that were given.
+        usual: Options otherwise.
+    """
+    words = [""]
+    for field, value in changes.items():
+        if field not in SAME_NUMBERS and value != usual.get(field):
+            values = value if isinstance(value, tuple) else (value,)
+            words += [field, *(str(x).replace(" ", "-") for x in values)]
+    return "_".join(words)
+
+
 def make_set(
     ground_truth: Columns,
     predictions: Columns,
@@ -189,7 +210,8 @@ def compute_results(
 
     With `options.bootstrap` and known sequences, all protocols have intervals over all
     frames, and the main protocols also per weather. The interval of a weather is computed
-    by resampling its sequences; there is none if it has only one sequence.
+    by resampling its sequences. There is none if the frames, or those with objects of the
+    class, are of a single sequence.
 
     Args:
         data: Evaluation set.
@@ -210,6 +232,7 @@ def compute_results(
         part, weights = data, None
         if sequence is not None and np.unique(sequence[mask]).size > 1:
             part = data if mask.all() else data.of_frames(mask)
+            is_single = in_one_sequence(part, sequence[mask])
             weights = sequence_weights(
                 sequence[mask], resamples=options.bootstrap, seed=0
             )
@@ -229,6 +252,7 @@ def compute_results(
                 if weights is not None and protocol in has_interval:
                     metric = protocol, group[0].space, group[0].iou
                     samples = resample(part, weights, *metric, **settings)
+                    samples[:, is_single] = np.nan
                     pairs = zip(group, map(interval, samples.T), strict=True)
                     group = [
                         dataclasses.replace(row, low=low, high=high)
@@ -293,6 +317,18 @@ def resample(
         results = data.results(protocol, weights=weight, curves=False, **metric)
         samples.append([*(result.ap_or_none for result in results), mean_ap(results)])
     return np.array(samples, np.float64)  # None becomes NaN
+
+
+def in_one_sequence(
+    data: EvaluationSet, sequence: Shaped[np.ndarray, " F"]
+) -> Bool[np.ndarray, " _"]:
+    """Returns a mask `[C + 1]` of the classes whose objects are in a single sequence.
+
+    Their APs hardly vary when sequences are resampled. The last entry, of the mean, is
+    False.
+    """
+    counts = [np.unique(sequence[has]).size for has in data.gt_count.T > 0]
+    return np.array([*(count == 1 for count in counts), False])
 
 
 def interval(samples: Float[np.ndarray, " B"]) -> tuple[float, float]:

@@ -24,7 +24,12 @@ from radejax.data.projection import decode
 from radejax.evaluation.boxes import Columns, roi_bounds, tables_from_frames, take
 from radejax.evaluation.evaluation_set import Result
 from radejax.evaluation.report import Report, write_report
-from radejax.evaluation.results import EvaluationOptions, compute_results, make_set
+from radejax.evaluation.results import (
+    EvaluationOptions,
+    compute_results,
+    make_set,
+    name_of_changes,
+)
 from radejax.inference.detector import Detector, check_backbone
 from radejax.inference.predict import predict_dataset
 from radejax.inference.saved import PathLike, SavedModel, Step, load_model
@@ -243,10 +248,6 @@ class Evaluation:
             yield name, draw_frame(self._scene(predictions, index))
 
 
-_SAME_NUMBERS = ("bootstrap", "batch_size", "num_visualizations", "figures", "plots")
-"""Options of an evaluation that do not change its APs."""
-
-
 def named_aps(results: Sequence[Result]) -> dict[str, float]:
     """Return the APs over all frames by metric and class, and means by m and metric."""
     return {
@@ -306,10 +307,7 @@ def evaluate_run(
     name += "" if split == "test" else f"_{files.as_path(split).stem}"
     name += "" if shuffle_images is None else "_shuffled"
     name += "" if step is None else f"_checkpoint_{step}"
-    for field, value in changes.items():
-        if field not in _SAME_NUMBERS and value != getattr(usual, field):
-            values = value if isinstance(value, tuple) else (value,)
-            name += "_".join(["", field, *(str(x).replace(" ", "-") for x in values)])
+    name += name_of_changes(changes, vars(usual))
     run = run or workdir.name
     if step == "best" and other is None and split in (data.choosing_split, "all"):
         run += f" (chosen on the {data.choosing_split} split)"

@@ -176,6 +176,9 @@ def test_score_evaluates_predictions_in_files(tmp_path: pathlib.Path) -> None:
     assert "100.0" in text.output
     assert (tmp_path / "out" / "metrics.json").is_file()
     assert json.loads(_run(*arguments, "--json").stdout)
+    for words, end in (((), ""), (("--roi", "wide", "--bootstrap", 0), "_roi_wide")):
+        text = _run("score", tmp_path / "kitti", *words).output
+        assert text.endswith(f"Written to {tmp_path / 'kitti_evaluation'}{end}\n")
 
 
 def test_simulate_works_anywhere(

@@ -57,10 +57,13 @@ def test_a_run_does_not_differ_from_itself(scene):
     assert {row.kind for row in rows} == {"all", "weather", "distance"}
     seeds = {f"seed{i}": data for i in range(3)}
     for row in rows + compare(seeds, seeds, scene[2], options):
-        found = row.difference, row.low, row.high
-        assert found == pytest.approx((0, 0, 0), abs=1e-6)
-        assert row.p_value == 1
+        assert row.difference == pytest.approx(0, abs=1e-6)
         assert not row.is_significant
+        if np.isnan(row.low):  # one sequence has all objects
+            assert row.kind != "all"
+            continue
+        assert (row.low, row.high) == pytest.approx((0, 0), abs=1e-6)
+        assert row.p_value == 1
 
 
 def test_a_large_difference_is_significant_and_antisymmetric(scene):
@@ -72,8 +75,9 @@ def test_a_large_difference_is_significant_and_antisymmetric(scene):
     backward = compare(goods, bads, frames, options)
     for one, other in zip(forward, backward, strict=True):
         assert one.difference == pytest.approx(-other.difference)
-        assert (one.low, one.high) == pytest.approx((-other.high, -other.low))
-        assert one.p_value == pytest.approx(other.p_value)
+        ends = pytest.approx((-other.high, -other.low), nan_ok=True)
+        assert (one.low, one.high) == ends
+        assert one.p_value == pytest.approx(other.p_value, nan_ok=True)
     sedan = next(row for row in forward if row.cls == "Sedan")
     assert sedan.difference > 10
     assert sedan.low > 0
@@ -103,6 +107,34 @@ def test_the_comparison_is_paired(scene):
 def test_holm():
     adjusted = comparison._holm([0.01, 0.04, 0.03, 0.005])
     assert adjusted == pytest.approx([0.03, 0.06, 0.06, 0.02])
+
+    assert comparison._holm([0.01, np.nan, 0.04]) == pytest.approx(
+        [0.02, np.nan, 0.04], nan_ok=True
+    )
+
+
+@pytest.mark.parametrize("num_seeds", [1, 3])
+def test_a_class_in_one_sequence_is_not_tested(scene, num_seeds):
+    truth, found, frames = scene
+    sequence = dict(zip(frames["frame"], frames["sequence"], strict=True))
+    number = np.array([sequence[frame] for frame in truth["frame"]])
+    is_kept = (truth["cls"] != "Sedan") | (number == number[0])
+    truth = {name: column[is_kept] for name, column in truth.items()}
+    good, bad = make(truth, found, frames), make(truth, thin(found, 0.3), frames)
+    runs = [{f"seed{i}": data for i in range(num_seeds)} for data in (bad, good)]
+    rows = compare(*runs, frames, settings())
+    tables = comparison.comparison_tables(rows, "a", "b")
+    words = {cell for table in tables for row in table.rows for cell in row}
+    assert ("not tested" in words) == (num_seeds == 3)
+    assert "-" in words
+    for row in rows:
+        values = row.low, row.high, row.p_value, row.p_adjusted
+        if row.cls == "Sedan":
+            assert np.isnan(values).all()
+            assert row.is_significant is None
+        elif row.kind == "all":
+            assert not np.isnan(values).any()
+            assert (row.is_significant is None) == (num_seeds == 1)
 
 
 def test_runs_on_different_data_cannot_be_compared(scene):
@@ -169,8 +201,7 @@ def test_a_gain_is_printed_with_its_deviation_and_paired_by_seed():
     assert p_value > 0.3
     a[:, 1:] = b[:, 1:] = np.nan  # the class is in no resample
     *_, low, high, p_value = comparison._difference(a, b, True, 9)
-    assert np.isnan([low, high]).all()
-    assert p_value == 1
+    assert np.isnan([low, high, p_value]).all()
 
 
 def drawn_training(rng, truth, frames):

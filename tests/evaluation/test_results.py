@@ -13,6 +13,7 @@ from radejax.evaluation.results import (
     exclusion_counts,
     interval,
     make_set,
+    name_of_changes,
     resample,
     sequence_weights,
 )
@@ -50,6 +51,27 @@ def test_weights_draw_whole_sequences():
     np.testing.assert_array_equal(weights, again)
     with pytest.raises(UserError, match="at least 2 sequences to resample, found 1"):
         sequence_weights(np.zeros(4), resamples=10, seed=0)
+
+
+def test_a_class_in_one_sequence_has_no_interval(scene):
+    truth, found, frames = scene
+    sequence = dict(zip(frames["frame"], frames["sequence"], strict=True))
+    number = np.array([sequence[frame] for frame in truth["frame"]])
+    is_kept = (truth["cls"] != "Sedan") | (number == number[0])
+    truth = {name: column[is_kept] for name, column in truth.items()}
+    data = EvaluationSet(truth, found, classes=CLASSES, frames=frames)
+    for row in compute_results(data, frames, OPTIONS):
+        if row.condition == "all":
+            assert np.isnan([row.low, row.high]).all() == (row.cls == "Sedan")
+
+
+def test_folders_are_named_after_options_that_change_numbers():
+    usual = {"roi": "narrow", "split": "test"}
+    changes = {"roi": "narrow", "bootstrap": 5, "kitti": True, "figures": "pdf"}
+    assert name_of_changes(changes, usual) == ""
+    changes |= {"roi": None, "classes": ("Sedan", "Bus or Truck"), "sequences": (5,)}
+    expected = "_roi_None_classes_Sedan_Bus-or-Truck_sequences_5"
+    assert name_of_changes(changes, usual) == expected
 
 
 def test_weights_of_a_condition_give_the_condition(scene, data):
