@@ -49,9 +49,6 @@ FORMAT = "radejax-2"
 FROZEN_BACKBONE = "sha256 of the frozen image backbone"
 """Key of the first 16 digits of the checksum in a checkpoint's description of its run."""
 
-RADAR_DATA, TENSORS = "radar data", "tensors"
-"""Key of the radar data in it: a reduced release, or `TENSORS`."""
-
 Step = int | Literal["best"] | None
 """Step of a checkpoint, "best" by the metric of the run, or None for the latest."""
 

@@ -28,7 +28,7 @@ from radejax.data.dataset import FrameSequence, LabelledFrames, data_set
 from radejax.data.kradar.dataset import held_out
 from radejax.data.projection import decode
 from radejax.data.records import Records
-from radejax.inference.saved import RADAR_DATA, TENSORS, SavedModel
+from radejax.inference.saved import SavedModel
 from radejax.runs.checks import check_bins
 from radejax.simulation.dataset import simulate_dataset
 from radejax.training import distributed
@@ -389,7 +389,7 @@ def data_of_run(
 
     Raises:
         UserError: The run has no data and none are given, or the data are of another
-            radar grid or form.
+            radar grid.
         FileNotFoundError: A folder is missing.
     """
     config = saved.config.copy_and_resolve_references()
@@ -411,11 +411,6 @@ def data_of_run(
     found, name = data.frames.grid, f"the radar of {options.roots[0]}"
     expected = f"{records.describe_grid(saved.grid)}, as the model was trained"
     require(found == saved.grid, name, records.describe_grid(found), expected)
-    form = data.frames.release or TENSORS
-    trained_on = saved.run.get(RADAR_DATA, form)
-    name = f"form of the radar data of {options.roots[0]}"
-    expected = f"{trained_on!r}, as the model was trained"
-    require(form == trained_on, name, form, expected)
     return config, data
 
 

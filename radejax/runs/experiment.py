@@ -35,14 +35,12 @@ from radejax.core import files
 from radejax.core.config import without_data_paths
 from radejax.core.errors import require
 from radejax.core.files import PathLike
-from radejax.data.dataset import LabelledFrames
+from radejax.data.dataset import FrameSequence
 from radejax.data.records import open_embeddings
 from radejax.evaluation.report import Table, number, numbers, write_tables
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.saved import (
     FROZEN_BACKBONE,
-    RADAR_DATA,
-    TENSORS,
     StartingWeights,
     starting_weights,
 )
@@ -224,7 +222,7 @@ def checkpoint_info(
     return {**values, "run": dict(run), "same": dict(same)}
 
 
-def _invariants(frames: LabelledFrames, weights: StartingWeights) -> dict[str, Any]:
+def _invariants(frames: FrameSequence, weights: StartingWeights) -> dict[str, Any]:
     """Returns properties of the data and frozen weights that a run must not change.
 
     Folders may move. Therefore frames are identified by their keys, and the frozen
@@ -232,7 +230,6 @@ def _invariants(frames: LabelledFrames, weights: StartingWeights) -> dict[str, A
     """
     keys = "\n".join(frame.key for frame in frames)
     values = {
-        RADAR_DATA: frames.release or TENSORS,
         "frames to train on": len(frames),
         "sha256 of their keys": hashlib.sha256(keys.encode()).hexdigest()[:16],
     }

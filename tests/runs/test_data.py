@@ -15,7 +15,6 @@ from radejax.core.config import base_config
 from radejax.core.errors import UserError
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.reduce import reduce_dataset
-from radejax.inference.saved import SavedModel
 from radejax.runs import checks
 from radejax.runs import data as run_data
 from radejax.runs.data import Data, data_name, data_of_run, located, open_data
@@ -145,14 +144,6 @@ def test_reduced_releases_are_read_with_and_without_doppler(
         data = _open(config)
         assert data.frames.grid.num_doppler == doppler_bins
         found[doppler_bins] = data.records[data.split("test")[0].key]
-        run = {"radar data": "polar3d"}
-        saved = SavedModel(config, data.records.grid, {}, run=run)
-        assert data_of_run(saved)[1].records.grid == saved.grid
-        run["radar data"] = "tensors"
-        with pytest.raises(
-            UserError, match=r"form of the radar data of .* is 'polar3d'"
-        ):
-            data_of_run(saved)
     assert found[16].shape == (64, 56, 16 + 9)
     np.testing.assert_array_equal(found[0], found[16][..., 16:])
     config.data.roots, config.simulation = (str(root),), None
@@ -223,7 +214,7 @@ def test_a_run_is_evaluated_on_its_part_or_on_all_of_other_folders(
     frames, copy = KRadar(root), str(shutil.copytree(root, tmp_path / "copy"))
     given = str(tmp_path / "copy")  # any folder that exists
     own = located(_config(root, sequences=(1, 3), labels=given, embeddings=given))
-    saved: Any = SimpleNamespace(config=own, grid=frames.grid, run={})
+    saved: Any = SimpleNamespace(config=own, grid=frames.grid)
     saved.model = models.build(own.model)
     with monkeypatch.context() as patch:
         patch.setattr(run_data, "Data", lambda *_: SimpleNamespace(frames=frames))
