@@ -96,6 +96,7 @@ def front_images(
     paths: Sequence[pathlib.Path],
     detector: Detector,
     labels: PathLike | None = None,
+    version: str = "v2.1",
     camera_calibration: PathLike | None = None,
     roots: Sequence[PathLike] = (),
 ) -> dict[pathlib.Path, tuple[pathlib.Path, Camera]]:
@@ -106,6 +107,7 @@ def front_images(
         detector: Detector of a radar-camera model.
         labels: Label revision, see `KRadar`. If None, the label files of the sequences
             are used, and sequences without them have no images.
+        version: Version of the labels.
         camera_calibration: Folder of camera calibrations; None for those in the roots.
         roots: Files and folders in which `find_frames` searched. Folders of sequences
             without radar files may have their images and labels.
@@ -133,7 +135,7 @@ def front_images(
     frames = KRadar(
         sorted({folder.parent for folder in sequences}) + sorted(others),
         labels,
-        version=detector.saved.config.data.label_version,
+        version=version,
         visibility=None,
         field_of_view=False,
         sequence_numbers={int(folder.name) for folder in sequences},
@@ -304,7 +306,9 @@ def _files(
     keys = [key_of(path) for path in frames]
     images: list[Any] = []
     if detector.takes_camera:
-        known = front_images(frames, detector, labels, camera_calibration, paths)
+        version = detector.saved.config.data.label_version
+        own = labels, version, camera_calibration, paths
+        known = front_images(frames, detector, *own)
         images = [known.get(path.absolute(), (None, None)) for path in frames if known]
     return keys, frames.__getitem__, images
 
