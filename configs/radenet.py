@@ -107,8 +107,12 @@ SIGMAS = {
 CLASS_SETS = ("all", "sedan")
 
 RELEASES = {
-    "polar3d": {"model.input_center": 0.52, "model.input_scale": 25.0},
-    "rpc": {"model.input_center": 0.5, "model.input_scale": 25.0},
+    name: {
+        "data.release": name,
+        "model.input_center": center,
+        "model.input_scale": 25.0,
+    }
+    for name, center in (("polar3d", 0.52), ("rpc", 0.5))
 }
 """Fields for K-Radar's reduced releases, see `radejax.data.reduced`."""
 

@@ -317,6 +317,9 @@ _FIELDS: dict[str, Any] = {
         "roots": (),
         # Folder or zip of a label revision; None: the labels in the roots.
         "labels": placeholder(str),
+        # Form of the radar data that a model is for, polar3d or rpc (reduced releases);
+        # None: radar tensors, or projections of them.
+        "release": placeholder(str),
         # Folder of preprocessed projections; None: in the first root.
         "records": placeholder(str),
         # Folder of embedded images (`radejax embed`); None: the images themselves.

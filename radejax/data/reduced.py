@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, Real
 
-from radejax.core.errors import DataError
+from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike, as_path
 from radejax.data.projection import MAX_ZERO_SHARE, to_log_scale
 from radejax.geometry.radar_grid import RadarGrid
@@ -60,6 +60,29 @@ _KRADAR_DOPPLER_MPS = np.linspace(-1.932591218305504, 1.872197742733457, 64)
 def is_reduced_file(path: PathLike) -> bool:
     """Returns True if a file is named like those of the reduced releases."""
     return as_path(path).name.startswith(("polar3d_", "rpc_", "sprdr_"))
+
+
+def check_release(found: str | None, expected: str | None, name: str) -> None:
+    """Raises a `UserError` unless radar data have the form that a model is for.
+
+    Args:
+        found: Reduced release of the data; None for radar tensors and projections.
+        expected: `config.data.release` of the model.
+        name: Name of the data in the message.
+    """
+    if found != expected:
+        raise UserError(
+            f"{name}: {found or 'radar tensors'}, but the model is for "
+            f"{expected or 'radar tensors'} (config.data.release is {expected}); use data "
+            f"of that form, or train with --config.data.release={found} and the input "
+            "scaling of this form, as the configs radenet:polar3d and radenet:rpc do"
+        )
+
+
+def release_of_file(path: PathLike) -> str | None:
+    """Returns the release that the name of a file tells, or None for others."""
+    name = as_path(path).name.partition("_")[0]
+    return name if name in RELEASES else None
 
 
 def is_reduced(frame: Real[np.ndarray, "..."], grid: RadarGrid) -> bool:
@@ -272,8 +295,9 @@ def _check_power(power: Float[np.ndarray, "..."], name: str) -> None:
     """Raises a `DataError` if powers are not on the scale of the releases."""
     low, high = float(power.min()), float(power.max())
     share = 0.0 if low else np.mean(power == 0)
-    is_decibels = _MIN_DECIBELS < low <= high < 2 * low
-    if not 0 <= low <= high <= _MAX_POWER or is_decibels or share > MAX_ZERO_SHARE:
+    # Powers of a whole frame differ by more than a factor of 2, logarithms by less.
+    is_log = 0 < low <= high < 2 * low and (power.ndim == 3 or low > _MIN_DECIBELS)
+    if not 0 <= low <= high <= _MAX_POWER or is_log or share > MAX_ZERO_SHARE:
         raise DataError(
             f"{name}: powers from {low:.3g} to {high:.3g}, {share:.0%} of them 0; expected "
             f"linear power (not decibels) divided by {POWER_UNIT:g}, at most 5 % of them 0"

@@ -33,7 +33,13 @@ from radejax.data.projection import (
     stack_frames,
     to_log_scale,
 )
-from radejax.data.reduced import is_reduced, project_reduced
+from radejax.data.reduced import (
+    RELEASES,
+    check_release,
+    is_reduced,
+    project_reduced,
+    release_of_file,
+)
 from radejax.data.tesseract import read_frame
 from radejax.detection.decode import ROI_LIMITS, DecodeOptions, decode, is_roi
 from radejax.geometry.camera import (
@@ -302,7 +308,8 @@ class Detector:
 
     def _read(self, frames: Frames, num_frames: int) -> Real[Any, "B ..."]:
         """Return the frames of samples as one array, and count invalid ones."""
-        radar = radar_batch(frames, self.grid, num_frames)
+        release = self.saved.config.data.get("release")
+        radar = radar_batch(frames, self.grid, num_frames, release)
         num_invalid = count_invalid(radar, warn=not self.num_invalid_frames)
         with self._lock:
             self.num_invalid_frames += num_invalid
@@ -470,7 +477,7 @@ def as_numbers(values: Any, name: str) -> Any:
 
 
 def radar_batch(
-    frames: Frames, grid: RadarGrid, num_frames: int = 1
+    frames: Frames, grid: RadarGrid, num_frames: int = 1, release: str | None = None
 ) -> Real[Any, "B ..."]:
     """Combine radar frames into one array with a leading axis B.
 
@@ -479,26 +486,38 @@ def radar_batch(
             `Detector.__call__`.
         grid: Axes of the sensor.
         num_frames: Number T of frames of a sample.
+        release: Form of the radar data that the model is for, `config.data.release`.
+            Arrays of projections may be of any form.
 
     Returns:
         Projections `[B T, R, A, D+E]` or tesseracts `[B T, D, R, E, A]`.
 
     Raises:
-        UserError: The shape is that of no radar data, or there is no frame.
+        UserError: The shape is that of no radar data, the data have another form than
+            `release`, or there is no frame.
         DataError: A file is corrupted, or one frame of a reduced release is not as in the
             release.
     """
-    radar = _read_paths(frames, lambda path, _: read_frame(path, grid))
+
+    def read(path: pathlib.Path, _: int) -> np.ndarray:
+        # Records have projections of any form.
+        if path.suffix != ".npy" or path.name.startswith(("DERA_", *RELEASES)):
+            check_release(release_of_file(path), release, str(path))
+        return read_frame(path, grid)
+
+    radar = _read_paths(frames, read)
     if isinstance(radar, list):
         if not radar:
             raise UserError("no frames: the list is empty")
-        radar = np.stack([_projected(frame, grid) for frame in radar])
-    radar = _projected(radar, grid)
+        radar = np.stack([_projected(frame, grid, release) for frame in radar])
+    radar = _projected(radar, grid, release)
     shape = tuple(np.shape(radar))
     projection, tesseract = grid.projection_shape, grid.shape_drea
     axes, steps = ("B", ()) if num_frames == 1 else (f"B, {num_frames}", (num_frames,))
     for frame in (projection, tesseract):
         if shape in ((*steps, *frame), (*shape[:1], *steps, *frame)) and shape[0]:
+            if frame == tesseract:
+                check_release(None, release, "frames")
             return radar.reshape(-1, *frame)
     text = (
         f"frames have shape {list(shape)}; expected projections [{axes}, R, A, D+E] = "
@@ -511,10 +530,12 @@ def radar_batch(
     raise UserError(text)
 
 
-def _projected(frames: Any, grid: RadarGrid) -> Any:
+def _projected(frames: Any, grid: RadarGrid, release: str | None) -> Any:
     """Convert an array to numbers, and frames of a reduced release to projections."""
     array = as_numbers(frames, "frames")
     if is_reduced(array, grid):
+        found = "rpc" if array.ndim == 2 else "polar3d"
+        check_release(found, release, "frames")
         return project_reduced(np.asarray(array), grid)
     return array
 

@@ -115,6 +115,9 @@ def export(
     expected = "projection, as config.data.num_frames of the model is above 1"
     is_possible = detector.num_frames == 1 or not is_tensor
     require(is_possible, "input", radar_input, expected)
+    release = detector.saved.config.data.get("release")
+    expected = f"projection, as the model is for {release} files"
+    require(not (release and is_tensor), "input", radar_input, expected)
     *bins, channels = grid.projection_shape
     projection = *bins, detector.num_frames * channels
     shape = grid.shape_drea if is_tensor else projection
@@ -146,6 +149,8 @@ def _readme(detector: Detector, shape: Sequence[int], left_out: Sequence[str]) -
     """Return the text of the model card."""
     radar = "Power of radar tensors" if len(shape) == 4 else "Projections"
     config = detector.saved.config
+    if release := config.data.get("release"):
+        radar = f"Projections of K-Radar's {release} files"
     is_simulated = (config.get("simulation") or {}).get("scenes") == "procedural"
     return _MODEL_CARD.read_text().format(
         name=type(detector.model).__name__,

@@ -27,6 +27,7 @@ from radejax.data.cameras import CameraOptions
 from radejax.data.dataset import data_set
 from radejax.data.kradar.conditions import WEATHERS
 from radejax.data.kradar.labels import LABEL_CLASSES, VERSIONS, VISIBILITY_FLAGS
+from radejax.data.reduced import RELEASES
 from radejax.detection.decode import DecodeOptions
 from radejax.evaluation.results import EvaluationOptions
 from radejax.geometry.radar_grid import RadarGrid
@@ -40,6 +41,7 @@ _SEQUENCES = several(integer(1), "different sequence numbers; () for all")
 # Fields that no constructor checks, or only one that reads data.
 _DATA = {
     "roots": (all, "folders"),
+    "release": or_none(one_of(*RELEASES)),
     "label_version": _VERSIONS,
     "visibility": or_none(
         several(one_of(*VISIBILITY_FLAGS), f"different flags of {VISIBILITY_FLAGS}")

@@ -21,7 +21,7 @@ from radejax.core.config import DATA_PATHS
 from radejax.core.errors import UserError, require
 from radejax.core.files import as_path
 from radejax.core.structures import Batch
-from radejax.data import pipeline, records
+from radejax.data import pipeline, records, reduced
 from radejax.data.augment import Augmentation
 from radejax.data.cameras import CameraOptions
 from radejax.data.dataset import FrameSequence, LabelledFrames, data_set
@@ -95,6 +95,8 @@ class Data:
             sequence_numbers=options.sequences or None,
             weather=options.weather or None,
         )
+        name = f"radar data in {', '.join(options.roots)}"
+        reduced.check_release(self.frames.release, options.get("release"), name)
         if self.frames.release is not None and not config.model.doppler_bins:
             self.frames.grid = self.frames.grid.without_doppler()
         if options.format != "kradar":  # the reader of K-Radar checks its labels itself

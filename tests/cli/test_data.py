@@ -12,10 +12,12 @@ import pytest
 
 from radejax import Detector, KRadar, models
 from radejax.cli import figures, main
-from radejax.core.errors import DataError
+from radejax.core.errors import DataError, UserError
 from radejax.data.cameras import CameraOptions
 from radejax.data.records import Records
+from radejax.data.tesseract import read_tesseract
 from radejax.inference.detect_files import find_frames, front_images
+from radejax.inference.export import export
 from radejax.inference.saved import SavedModel, save_model
 from radejax.simulation.config import default_config
 from radejax.simulation.dataset import simulate_dataset
@@ -70,9 +72,10 @@ def disks(
     return request.param, (radar, others), labels
 
 
-def _model(doppler_bins: int, root: pathlib.Path) -> SavedModel:
+def _model(doppler_bins: int, root: pathlib.Path, release: str | None) -> SavedModel:
     """An untrained radar-only model for the simulated radar."""
     config = small.radar_config()
+    config.data.release = release
     config.model.update(doppler_bins=doppler_bins, elevation_bins=3)
     grid = KRadar(root).grid
     grid = grid if doppler_bins else grid.without_doppler()
@@ -114,7 +117,7 @@ def test_boxes_are_found_in_files_and_arrays(
     disks: Any, tensors: pathlib.Path, tmp_path: pathlib.Path, doppler_bins: int
 ) -> None:
     release, roots, _ = disks
-    saved = _model(doppler_bins, tensors)
+    saved = _model(doppler_bins, tensors, release)
     save_model(saved, tmp_path / "model")
     words = ("--workdir", tmp_path / "model", "--out", tmp_path / "boxes")
     assert "in 12 frames" in _run("detect", roots[0], *words).output
@@ -131,6 +134,35 @@ def test_boxes_are_found_in_files_and_arrays(
     np.testing.assert_array_equal(detector(arrays[0]).boxes, expected[:1])
     with pytest.raises(DataError, match=r"^frame: "):
         detector([arrays[0] * 1e13])
+    with pytest.raises(UserError, match="input is 'tensor', expected projection, as"):
+        export(detector, tmp_path / "program", radar_input="tensor")
+    export(detector, tmp_path / "program", kind="huggingface")
+    card = (tmp_path / "program" / "README.md").read_text()
+    assert f"Projections of K-Radar's {release} files [B, 24, 16," in card
+
+
+@pytest.mark.parametrize("release", [None, "polar3d", "rpc"])
+def test_a_detector_takes_the_form_that_it_was_trained_on(
+    disks: Any, tensors: pathlib.Path, release: str | None
+) -> None:
+    found, roots, _ = disks
+    detector = Detector(_model(4, tensors, release), batch_sizes=(1,))
+    path = next(roots[0].glob(f"1/{found}_*.npy"))
+    tensor = next(tensors.glob("1/radar_tesseract/*.mat"))
+    for frame, form in (
+        (path, found),
+        (np.load(path), found),
+        ([np.load(path)], found),
+        (tensor, None),
+        (read_tesseract(tensor), None),
+    ):
+        if form == release:
+            detector(frame)
+        else:
+            with pytest.raises(UserError, match="but the model is for"):
+                detector(frame)
+    projection = KRadar(tensors)[0].read_projection(detector.grid)
+    detector(projection)
 
 
 def test_images_on_another_disk_are_found(disks: Any) -> None:
@@ -194,9 +226,10 @@ def test_a_run_is_trained_evaluated_and_detects(
 ) -> None:
     from radejax.cli.train import train
 
-    _, roots, labels = disks
+    release, roots, labels = disks
     config = small.radar_config()
     config.model.update(doppler_bins=doppler_bins, elevation_bins=3)
+    config.data.release = release
     config.train.update(batch_size=4, num_epochs=1, checkpoint_every_steps=1)
     config.evaluation.num_visualizations = 1
     path = small.write_config(tmp_path / "config.py", config)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from radejax.core.config import load_module
-from radejax.core.errors import DataError
+from radejax.core.errors import DataError, UserError
 from radejax.data import reduced
 from radejax.data.projection import project_tensor, to_log_scale
 from radejax.data.reduced import (
@@ -265,3 +265,24 @@ def test_levels_are_those_of_the_projection():
     power = np.float32([1e-4, 3.0])
     found = to_log_scale(power * np.float32(reduced.POWER_UNIT))
     np.testing.assert_allclose(found, level_of(power.astype(float)), atol=1e-6)
+
+
+def test_files_tell_their_form_by_their_names():
+    names = ("polar3d_00001.npy", "a/rpc_00001.npy", "tesseract_00001.mat", "x.npy")
+    found = [reduced.release_of_file(name) for name in names]
+    assert found == ["polar3d", "rpc", None, None]
+
+
+@pytest.mark.parametrize("found", ["rpc", None])
+def test_a_model_is_for_one_form(found):
+    reduced.check_release(found, found, "frames")
+    text = rf"^1: {found or 'radar tensors'}, but the model is for polar3d"
+    with pytest.raises(UserError, match=text):
+        reduced.check_release(found, "polar3d", "1")
+
+
+def test_levels_of_a_projection_are_no_power():
+    levels = np.random.default_rng(0).uniform(0.45, 0.8, (2, *GRID.shape_drea[1:]))
+    levels = levels.transpose(0, 1, 3, 2)
+    with pytest.raises(DataError, match="expected linear power"):
+        project_reduced(levels, GRID)

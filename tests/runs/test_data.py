@@ -139,6 +139,7 @@ def test_reduced_releases_are_read_with_and_without_doppler(
     for doppler_bins in (16, 0):
         config = _config(reduced)
         config.model.doppler_bins = doppler_bins
+        config.data.release = "polar3d"
         config.simulation = ConfigDict(simulation)
         checks.check(config)
         data = _open(config)
@@ -146,6 +147,10 @@ def test_reduced_releases_are_read_with_and_without_doppler(
         found[doppler_bins] = data.records[data.split("test")[0].key]
     assert found[16].shape == (64, 56, 16 + 9)
     np.testing.assert_array_equal(found[0], found[16][..., 16:])
+    config.data.release = "rpc"
+    with pytest.raises(UserError, match=r"reduced: polar3d, but the model is for rpc"):
+        _open(config)
+    config.data.release = None
     config.data.roots, config.simulation = (str(root),), None
     del config.simulation
     with pytest.raises(

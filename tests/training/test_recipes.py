@@ -121,6 +121,8 @@ def test_an_option_for_a_release_changes_only_the_input(
     # Half of K-Radar's noise and all echoes are positive.
     assert 0.5 <= model.pop("input_center") <= 0.52
     assert model.pop("input_scale") == 25.0
+    assert config["data"].pop("release") == release
+    plain["data"].pop("release")
     plain["model"] = {k: v for k, v in plain["model"].items() if k in model}
     assert config == plain
 

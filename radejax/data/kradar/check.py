@@ -133,7 +133,7 @@ def check_dataset(
         except DataError as error:
             kind = "tesseract" if path.suffix == ".mat" else "projection"
             summary.problems.append((f"{kind} corrupted", str(error)))
-            corrupted[number] += kind == "tesseract"
+            corrupted[number] += 1
         except OSError as error:
             summary.problems.append(("tesseract not readable", str(error)))
     is_kradar = data.grid.shape_drea == RadarGrid.kradar().shape_drea
@@ -185,7 +185,7 @@ def _row(
         "images_missing": sum(frame.camera_path is None for frame in frames),
         "calibration": calibration,
         "tesseracts": len(_tensors(folder)),
-        "tesseracts_missing": sum(frame.tesseract_path is None for frame in frames),
+        "tesseracts_missing": sum(frame.radar_path is None for frame in frames),
     }
 
 

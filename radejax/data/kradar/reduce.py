@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import time
@@ -10,11 +11,12 @@ from collections.abc import Iterable
 import numpy as np
 from tqdm import tqdm
 
-from radejax.core.errors import DataError, require
+from radejax.core.archives import read_npy
+from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import PathLike, as_path, atomic_write
-from radejax.data.kradar.dataset import find_sequences, read_grid
+from radejax.data.kradar.dataset import find_release, find_sequences, read_grid
 from radejax.data.records import PreprocessReport
-from radejax.data.reduced import strongest_points
+from radejax.data.reduced import polar_shape, strongest_points
 from radejax.data.tesseract import read_polar
 
 _LEFT_OUT = shutil.ignore_patterns("radar_tesseract", "DERA_tesseract", "records*")
@@ -36,19 +38,32 @@ def reduce_dataset(
 
     Raises:
         FileNotFoundError: A root does not exist.
-        UserError: The rate is out of its range, or the grid has too few bins.
+        UserError: The rate is out of its range, there are no tensors, the grid has too few
+            bins, or the new dataset has frames of another form or rate.
         DataError: The folders are ambiguous.
     """
     require(0 < rate < 1, "rate", rate, "a number above 0 and below 1")
     began, out, paths = time.perf_counter(), as_path(out), list(map(as_path, roots))
     grid, targets = read_grid(paths), {}
-    for root in paths:
-        shutil.copytree(root, out, False, _LEFT_OUT, _link, dirs_exist_ok=True)
     for folder in find_sequences(paths).values():
         for path in folder.listing("radar_tesseract").values():
             name = f"{release}_{path.stem.rpartition('_')[2]}.npy"
             targets[path] = out / folder.folders[0].name / name
+    if not targets:
+        raise UserError(f"no radar_tesseract/*.mat in {', '.join(map(str, paths))}")
     missing = [path for path in targets if not targets[path].exists()]
+    if out.exists():
+        form = find_release(find_sequences([out]))
+        require(
+            form in (None, release), f"form of the radar data in {out}", form, release
+        )
+    if release == "rpc" and (done := targets.keys() - set(missing)):
+        points, size = read_npy(targets[min(done)], mapped=True), polar_shape(grid)[1:]
+        found = len(points) / math.prod(size)
+        is_same = abs(found - rate) < 0.1 * rate + 2 / math.prod(size)
+        require(is_same, "rate", rate, f"about {found:.3g}, as of the points in {out}")
+    for root in paths:
+        shutil.copytree(root, out, False, _LEFT_OUT, _link, dirs_exist_ok=True)
     skipped = {}
     for path in tqdm(missing, "reduce", unit="frame"):
         try:

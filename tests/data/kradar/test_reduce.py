@@ -68,6 +68,19 @@ def test_writing_resumes_and_lists_corrupted_tensors(kradar_root, tmp_path):
     assert (again.num_found, again.num_written, len(again.skipped)) == (10, 1, 1)
     with pytest.raises(UserError, match=r"rate is 1\.5, expected"):
         reduce_dataset([source], out, "rpc", 1.5)
+    with pytest.raises(UserError, match=r"form of the radar data in .* is 'polar3d'"):
+        reduce_dataset([source], out, "rpc")
+    with pytest.raises(UserError, match=r"no radar_tesseract/\*\.mat in"):
+        reduce_dataset([out], tmp_path / "again", "rpc")
+    assert not (tmp_path / "again").exists()
+
+
+def test_points_of_another_rate_are_not_mixed(kradar_root, tmp_path):
+    out = reduced_root(kradar_root, tmp_path / "out", "rpc")
+    (out / "2/rpc_00005.npy").unlink()
+    with pytest.raises(UserError, match=r"rate is 0\.1, expected about 0\.2, as of"):
+        reduce_dataset([kradar_root], out, "rpc", 0.1)
+    assert reduce_dataset([kradar_root], out, "rpc", 0.2).num_written == 1
 
 
 def test_tensors_in_decibels_are_not_reduced(kradar_root, kradar_writer, tmp_path):
