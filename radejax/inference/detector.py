@@ -522,7 +522,8 @@ def radar_batch(
     text = (
         f"frames have shape {list(shape)}; expected projections [{axes}, R, A, D+E] = "
         f"[{axes}, {', '.join(map(str, projection))}] or tesseracts [{axes}, D, R, E, A] = "
-        f"[{axes}, {', '.join(map(str, tesseract))}]"
+        f"[{axes}, {', '.join(map(str, tesseract))}], or single frames [2, R, A, E] or "
+        "[N, 11] of a reduced release"
     )
     if steps:
         text += f" of {num_frames} consecutive frames (config.data.num_frames), oldest "

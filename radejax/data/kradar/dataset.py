@@ -185,8 +185,8 @@ class KRadar(LabelledFrames[Frame]):
             if not self._label_paths:
                 raise UserError(
                     f"no {self.version} labels in the sequence folders of {names} "
-                    "(info_label/*.txt); name the folder or zip of a label revision as "
-                    "labels"
+                    "(info_label/*.txt); give the folder or zip of a label revision: "
+                    "--labels"
                 )
         else:
             self._label_source = str(labels)
