@@ -13,6 +13,7 @@
 | camera | the quickstart with and without a camera |
 | frames | samples of two consecutive frames and of one |
 | releases | radar tensors and K-Radar's reduced releases, made from the same scenes |
+| polar3d_camera | polar3d with and without a camera |
 
 A variant is an ordinary run of a config, or the run of another variant evaluated with shuffled
 images. Runs are trained on the scenes of their seed and evaluated on held-out scenes, which are
