@@ -410,7 +410,7 @@ def test_options_out_of_range_are_rejected(name, value):
 
 def test_wrong_shapes_are_rejected():
     maps, batch = small_scene(np.random.default_rng(9))
-    with pytest.raises(ValueError, match=r"24, 16, .* on the grid's 256 x 107 bins"):
+    with pytest.raises(ValueError, match=r"24, 16, .* on the grid's 256 x 112 bins"):
         detection_loss(maps, batch, STRETCHED)
     with pytest.raises(ValueError, match=r"must be \[3, N, 8\] .* got \(3, 4, 7\)"):
         detection_loss(maps, batch.replace(boxes=batch.boxes[..., :7]), GRID)
