@@ -409,9 +409,13 @@ def test_options_are_those_of_the_config():
 def test_wrong_shapes_are_rejected():
     logits, params, _, _ = scattered()
     run = partial(D.decode, max_detections=4, score_threshold=0.3)
-    with pytest.raises(ValueError, match=r"maps have 20 x 12 .* the grid 256 x 107"):
+    with pytest.raises(
+        ValueError, match=r"\(1, 20, 12, 3\) .* on the grid's 256 x 107 bins"
+    ):
         run(maps_of(logits, params), KRADAR)
-    with pytest.raises(ValueError, match=r"\[B, R, A, C\] and \[B, R, A, 8\], got"):
+    with pytest.raises(
+        ValueError, match=r"12, 7\), expected \[B, R, A, C\] and \[B, R, A, 8\]"
+    ):
         run(maps_of(logits, params[..., :7]), GRID)
     with pytest.raises(ValueError, match="at least 1 peak must enter NMS, got 0"):
         D.decode(maps_of(logits, params), GRID, max_detections=0, score_threshold=0.3)

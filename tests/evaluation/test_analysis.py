@@ -151,7 +151,11 @@ def _moved(found, column, change):
     ("column", "change", "expected"),
     [
         (6, np.rad2deg, r"60 predictions have \|yaw\| > 2 pi, up to 1\d\d"),
-        (2, lambda z: z + 0.7, r", \+0.7\d\) m .*; --z-offset -0.7\d moves"),
+        (
+            2,
+            lambda z: z + 0.7,
+            r", \+0.7\d\) m .*; --z-offset -0.7\d of `radejax score` moves",
+        ),
         (0, lambda x: x + 2.54, r"\(\+2.\d\d, .* LiDAR frame \+ \(-2.54, 0.3, 0\)"),
         (0, np.negative, r"60 of 60 predictions lie behind the sensor \(x < 0\)"),
     ],

@@ -28,6 +28,6 @@ def test_boxes_have_the_yaw_as_a_quaternion():
 
 def test_points_are_float32_one_after_the_other():
     columns = np.arange(10.0).reshape(5, 2)
-    names, data = ros2_node.point_bytes(Points(*columns))
+    names, data = ros2_node.point_bytes(Points(*columns, *np.zeros((3, 2), int)))
     assert len(data) == 2 * 4 * len(names)
     np.testing.assert_array_equal(np.frombuffer(data, "<f4").reshape(2, 5), columns.T)
