@@ -197,7 +197,7 @@ def reduce(roots: tuple[str, ...], out: pathlib.Path, **options: Any) -> None:
     "--method",
     type=click.Choice(["percentile", "cfar"]),
     default="percentile",
-    help="percentile: the strongest cells. cfar: bins above their neighborhood.",
+    help="percentile: the strongest cells. cfar: bins that exceed their neighborhood.",
 )
 @click.option(
     "--rate",
@@ -209,7 +209,7 @@ def reduce(roots: tuple[str, ...], out: pathlib.Path, **options: Any) -> None:
     "--threshold-db",
     type=entry.DECIBELS,
     default=9.0,
-    help="Power above the mean of the neighborhood (cfar only).",
+    help="Decibels above the mean of the neighborhood (cfar only).",
 )
 @entry.sequences
 @entry.weather
@@ -236,19 +236,28 @@ def points(
     from radejax.data.records import PreprocessReport
     from radejax.inference.detect_files import find_frames, sequence_folder
 
-    frames, skipped = find_frames(paths, sequence_numbers, weather), dict[str, str]()
+    frames = find_frames(paths, sequence_numbers, weather)
     folders = {path: sequence_folder(path) for path in frames}
+    sources, skipped = dict[pathlib.Path, pathlib.Path](), dict[str, str]()
+    for path, folder in folders.items():
+        name = f"rpc_{path.stem.rpartition('_')[2]}.{suffix}"
+        target = out.absolute() / folder.name / name
+        if target == path.absolute() or target in sources:
+            raise UserError(
+                f"{sources.get(target, path)} and {path} would both be {target}; name "
+                "another --out, or roots of one form of radar data"
+            )
+        sources[target] = path
     roots = {folder.parent for folder in folders.values()}
     grid = read_grid(sorted({*map(pathlib.Path, paths), *roots}))
     began = time.perf_counter()
-    for path, folder in tqdm.tqdm(folders.items(), "points", unit="frame"):
-        name = f"rpc_{path.stem.rpartition('_')[2]}.{suffix}"
+    for target, path in tqdm.tqdm(sources.items(), "points", unit="frame"):
         try:
             cloud = read_points(path, grid, **options)
         except (DataError, OSError) as error:
             skipped[str(path)] = str(error)
             continue
-        write_points(out / folder.name / name, cloud)
+        write_points(target, cloud)
     seconds = time.perf_counter() - began
     report = PreprocessReport(len(frames), 0, skipped, seconds)
     click.echo(report.to_text())

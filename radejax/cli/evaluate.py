@@ -184,9 +184,12 @@ def score(
 
     path, given = pathlib.Path(predictions), _given(options)
     source, settings = _settings(path, given, bootstrap=200)
-    usual = {"split": "test"} | vars(_settings(path, {}, bootstrap=200)[1])
-    names = [*usual, "sequences", "weather"]
-    changes = {name: given[name] for name in names if name in given}
+    # The names of the data would be long, so they are not part of the folder's.
+    usual: dict[str, Any] = {}
+    for part in _settings(path, {}, bootstrap=200):
+        usual |= vars(part)
+    names = usual.keys() - {"data", "labels", "ground_truth"}
+    changes = {name: value for name, value in given.items() if name in names}
     end = f"_evaluation{name_of_changes(changes, usual)}"
     folder = out or path.with_name(f"{path.stem}{end}")
     report = evaluate_files(path, folder, source, settings, run=name or path.stem)

@@ -153,6 +153,7 @@ def view(
     """
     import tqdm
 
+    from radejax.data.reduced import check_release
     from radejax.visualize.recordings import write_recording
 
     frames = radejax.KRadar(roots, visibility=None, **part)
@@ -163,6 +164,9 @@ def view(
         )
     shown = complete[:max_frames]
     detector = None if workdir is None else radejax.Detector.from_workdir(workdir)
+    if detector is not None:
+        release = detector.saved.config.data.get("release")
+        check_release(frames.release, release, f"radar data in {', '.join(roots)}")
     bar = tqdm.tqdm(shown, desc="record", unit="frame")
     grid = frames.grid if detector is None else detector.grid
     write_recording(viewer_scenes(bar, grid, detector), out)

@@ -318,7 +318,7 @@ _FIELDS: dict[str, Any] = {
         # Folder or zip of a label revision; None: the labels in the roots.
         "labels": placeholder(str),
         # Form of the radar data that a model is for, polar3d or rpc (reduced releases);
-        # None: radar tensors, or projections of them.
+        # None: radar tensors, or projections of them. Arrays of projections may be of any.
         "release": placeholder(str),
         # Folder of preprocessed projections; None: in the first root.
         "records": placeholder(str),

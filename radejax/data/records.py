@@ -126,7 +126,10 @@ class Records:
         Raises:
             DataError: The records are not projections, or `records.json` is corrupted.
         """
-        with wrap_read_errors(self.folder / _DESCRIPTION, "the records of a radar"):
+        path = self.folder / _DESCRIPTION
+        if "grid" not in self.source:
+            raise DataError(f"{path}: not the records of a radar")
+        with wrap_read_errors(path, "the records of a radar"):
             grid = RadarGrid.from_dict(self.source["grid"])
             if grid.projection_shape != self.shape:
                 raise ValueError(f"arrays of shape {self.shape}")

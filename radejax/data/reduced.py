@@ -71,11 +71,11 @@ def check_release(found: str | None, expected: str | None, name: str) -> None:
         name: Name of the data in the message.
     """
     if found != expected:
+        option = f"the option {found}" if found else "no option for a reduced release"
         raise UserError(
             f"{name}: {found or 'radar tensors'}, but the model is for "
             f"{expected or 'radar tensors'} (config.data.release is {expected}); use data "
-            f"of that form, or train with --config.data.release={found} and the input "
-            "scaling of this form, as the configs radenet:polar3d and radenet:rpc do"
+            f"of that form, or train with {option}, such as --config radenet:{found or ''}"
         )
 
 
@@ -295,8 +295,9 @@ def _check_power(power: Float[np.ndarray, "..."], name: str) -> None:
     """Raises a `DataError` if powers are not on the scale of the releases."""
     low, high = float(power.min()), float(power.max())
     share = 0.0 if low else np.mean(power == 0)
-    # Powers of a whole frame differ by more than a factor of 2, logarithms by less.
-    is_log = 0 < low <= high < 2 * low and (power.ndim == 3 or low > _MIN_DECIBELS)
+    # Powers of all cells differ by more than a factor of 2, logarithms of them by less.
+    is_whole = power.ndim == 3 and power.size > 1_000
+    is_log = 0 < low <= high < 2 * low and (is_whole or low > _MIN_DECIBELS)
     if not 0 <= low <= high <= _MAX_POWER or is_log or share > MAX_ZERO_SHARE:
         raise DataError(
             f"{name}: powers from {low:.3g} to {high:.3g}, {share:.0%} of them 0; expected "

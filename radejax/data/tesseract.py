@@ -163,6 +163,13 @@ def read_frame(path: PathLike, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
     return projection.astype(np.float32)
 
 
+def check_axes(grid: RadarGrid) -> None:
+    """Raise a `UserError` if there are too few bins for mean power and Doppler."""
+    least = min(grid.num_doppler - 1, grid.num_elevation)
+    expected = "at least (2, 2, 1, 2): Doppler, range, elevation, azimuth"
+    require(least > 0, "shape of the radar's grid", grid.shape_drea, expected)
+
+
 def read_polar(path: PathLike, grid: RadarGrid) -> Polar:
     """Return mean power and mean Doppler of all cells, see `radejax.data.reduced`.
 
@@ -176,9 +183,7 @@ def read_polar(path: PathLike, grid: RadarGrid) -> Polar:
         DataError: The file is corrupted, has another shape than the grid, or is a
             projection, which has no mean power.
     """
-    least = min(grid.num_doppler - 1, grid.num_elevation)
-    expected = "at least (2, 2, 1, 2): Doppler, range, elevation, azimuth"
-    require(least > 0, "shape of the radar's grid", grid.shape_drea, expected)
+    check_axes(grid)
     if is_reduced_file(path):
         return to_polar(read_npy(path), grid, str(path))
     if pathlib.Path(path).suffix == ".npy":

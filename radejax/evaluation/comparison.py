@@ -71,16 +71,15 @@ class Comparison:
         ap_b: AP of run B in the same way.
         difference: AP of run B minus AP of run A.
         std: Standard deviation of the difference over seeds; NaN if it is not tested.
-        low: Lower end of the 95 % interval of the difference; NaN if the objects of the
-            class are in a single sequence.
+        low: Lower end of the 95 % interval of the difference; NaN if the frames, or those
+            with objects of the class, are of a single sequence.
         high: Upper end of this interval.
         p_value: Two-sided p-value. If the difference is not tested, it is computed from
             the fraction of resamples in which the difference has the less frequent sign.
             NaN without an interval.
         p_adjusted: p-value after Holm's correction over all rows of the same kind that
-            have one; for
-            weathers and distances not below the smallest one over all frames, so that
-            equal runs differ in any row with a probability of at most 5 %.
+            have a p-value; for weathers and distances not below the smallest one over all
+            frames, so that equal runs differ in any row with a probability of at most 5 %.
         is_significant: Whether `p_adjusted` is below 0.05; None if the difference is not
             tested, because a run has fewer than `MIN_SEEDS` seeds or there is no interval.
     """
@@ -163,7 +162,8 @@ def compare(
     for _, of_kind in itertools.groupby(rows, lambda row: row.kind):
         group = list(of_kind)
         found = np.maximum(_holm([row.p_value for row in group]), least).tolist()
-        least = least or np.nanmin(found, initial=1)  # of all frames, the first group
+        if group[0].kind == "all":
+            least = min((p for p in found if not np.isnan(p)), default=1.0)
         for row, p in zip(group, found, strict=True):
             verdict = p < 1 - LEVEL if is_tested and not np.isnan(p) else None
             row = dataclasses.replace(row, p_adjusted=p, is_significant=verdict)

@@ -50,7 +50,7 @@ class Result(Curve):
         is_simulated: Whether the frames are simulated.
         condition: "all", or a weather.
         low: Lower end of the 95 % bootstrap interval; None if it was not computed, NaN if
-            the class does not occur.
+            the objects of the class are in fewer than two sequences.
         high: Upper end of this interval.
     """
 
@@ -72,6 +72,11 @@ class Result(Curve):
     def key(self) -> tuple[str, str, str, str, float]:
         """Protocol, condition, class, space and IoU threshold."""
         return self.protocol, self.condition, self.cls, self.space, self.iou
+
+    @property
+    def has_interval(self) -> bool:
+        """Whether there is a 95 % interval."""
+        return self.low is not None and not np.isnan(self.low)
 
     @property
     def metric(self) -> str:

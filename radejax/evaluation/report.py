@@ -110,7 +110,7 @@ def write_report(
         "left_out": {**(left_out or {}), **exclusion_counts(data, options)},
         "warnings": [*warnings, *analysis.sanity_checks(data)],
         "intervals": f"{options.bootstrap} resamples of sequences"
-        if any(result.low is not None for result in results)
+        if any(result.has_interval for result in results)
         else "none: they need --bootstrap and frames of two sequences or more",
         "ap": [to_row(result) for result in results],
         "subsets": {
@@ -359,14 +359,14 @@ def by_protocol(
         terms = f"{name}, score>{options.settings_of(name)['score_threshold']:g}"
         body.append([terms, *map(_with_interval, found)])
     title = f"AP {space.upper()} at IoU {iou:g} in every protocol, all weathers"
-    if any(result.low is not None for result in results.values()):
+    if any(result.has_interval for result in results.values()):
         title += f", 95 % intervals of {options.bootstrap} resamples of sequences"
     return Table(title, ["Protocol", *classes], body)
 
 
 def _with_interval(result: Result) -> str:
     """Formats an AP with its interval, if there is one, such as "61.05 [50.1, 70.2]"."""
-    if not result.is_defined or result.low is None:
+    if not (result.is_defined and result.has_interval):
         return number(result.ap_or_none)
     low, high = numbers((result.low, result.high), digits=1)
     return f"{number(result.ap)} [{low}, {high}]"

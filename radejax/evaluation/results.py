@@ -9,6 +9,7 @@ often as its sequence was drawn, which all protocols handle exactly.
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -146,8 +147,8 @@ class EvaluationOptions:
         return {"score_threshold": threshold, "empty_frames": self.empty_frames}
 
 
-SAME_NUMBERS = (
-    *("bootstrap", "batch_size", "num_visualizations", "figures", "plots", "kitti"),
+SAME_NUMBERS = frozenset(
+    ["bootstrap", "batch_size", "num_visualizations", "figures", "plots", "kitti"]
 )
 """Options of an evaluation that do not change its APs."""
 
@@ -163,7 +164,7 @@ def name_of_changes(changes: Mapping[str, Any], usual: Mapping[str, Any]) -> str
     for field, value in changes.items():
         if field not in SAME_NUMBERS and value != usual.get(field):
             values = value if isinstance(value, tuple) else (value,)
-            words += [field, *(str(x).replace(" ", "-") for x in values)]
+            words += [field, *(re.sub(r"[\\/ ]+", "-", str(x)) for x in values)]
     return "_".join(words)
 
 
@@ -324,11 +325,11 @@ def in_one_sequence(
 ) -> Bool[np.ndarray, " _"]:
     """Returns a mask `[C + 1]` of the classes whose objects are in a single sequence.
 
-    Their APs hardly vary when sequences are resampled. The last entry, of the mean, is
-    False.
+    Their APs hardly vary when sequences are resampled. The last entry, of the mean, is True
+    if this holds for every class that occurs.
     """
     counts = [np.unique(sequence[has]).size for has in data.gt_count.T > 0]
-    return np.array([*(count == 1 for count in counts), False])
+    return np.array([*(count == 1 for count in counts), max(counts) < 2])
 
 
 def interval(samples: Float[np.ndarray, " B"]) -> tuple[float, float]:

@@ -309,7 +309,8 @@ def _files(
         version = detector.saved.config.data.label_version
         own = labels, version, camera_calibration, paths
         known = front_images(frames, detector, *own)
-        images = [known.get(path.absolute(), (None, None)) for path in frames if known]
+        if known:
+            images = [known.get(path.absolute(), (None, None)) for path in frames]
     return keys, frames.__getitem__, images
 
 

@@ -535,8 +535,9 @@ def _projected(frames: Any, grid: RadarGrid, release: str | None) -> Any:
     """Convert an array to numbers, and frames of a reduced release to projections."""
     array = as_numbers(frames, "frames")
     if is_reduced(array, grid):
-        found = "rpc" if array.ndim == 2 else "polar3d"
-        check_release(found, release, "frames")
+        if array.shape[1] != 4:  # an error below explains points [N, 4]
+            found = "rpc" if array.ndim == 2 else "polar3d"
+            check_release(found, release, "frames")
         return project_reduced(np.asarray(array), grid)
     return array
 

@@ -236,12 +236,13 @@ class Bottleneck(nn.Module):
 
 
 def _stage(
-    name: str, depth: int, features: int, stride: int, frozen: bool, dtype: Any
+    name: str, depth: int, *, stride: int, **fields: Any
 ) -> Iterator[Bottleneck]:
     """Yields the blocks of a stage, of which the first has the stride."""
     for i in range(depth):
-        own = f"{name}_{i + 1}"
-        yield Bottleneck(features, 1 if i else stride, i == 0, frozen, dtype, name=own)
+        yield Bottleneck(
+            stride=1 if i else stride, is_first=i == 0, name=f"{name}_{i + 1}", **fields
+        )
 
 
 class ResNetTrunk(nn.Module):
@@ -268,9 +269,14 @@ class ResNetTrunk(nn.Module):
         x = nn.relu(_normalized(x, "stem_norm", self.frozen, self.dtype, train))
         x = nn.max_pool(x, (3, 3), (2, 2), ((1, 1), (1, 1)))
         for stage, depth in enumerate(self.depths, 1):
-            shape = self.width * 2 ** (stage - 1), 1 if stage == 1 else 2
-            kind = *shape, self.frozen, self.dtype
-            for block in _stage(f"stage_{stage}_block", depth, *kind):
+            for block in _stage(
+                f"stage_{stage}_block",
+                depth,
+                stride=1 if stage == 1 else 2,
+                features=self.width * 2 ** (stage - 1),
+                frozen=self.frozen,
+                dtype=self.dtype,
+            ):
                 x = block(x, train)
         return x.astype(jnp.float32)
 
@@ -296,6 +302,7 @@ class ResNetNeck(nn.Module):
     ) -> Float[jax.Array, "B (h+1)//2 (w+1)//2 {self.features}"]:
         """Runs the neck; the arguments are those of `CameraNeck`, with x the trunk's output."""
         mask = counted_frames(has_image)
-        for block in _stage("block", self.depth, 8 * self.width, 2, False, self.dtype):
+        fields = {"features": 8 * self.width, "frozen": False, "dtype": self.dtype}
+        for block in _stage("block", self.depth, stride=2, **fields):
             x = block(x, train, mask)
         return Conv(self.features, 1, use_bias=False, dtype=self.dtype, name="proj")(x)

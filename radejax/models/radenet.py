@@ -111,8 +111,8 @@ class RadeNet(nn.Module):
         require(is_some, "config.model.elevation_bins", self.elevation_bins, least)
         stride = 2 ** len(self.widths)
         expected = f"a multiple of {stride} for {len(self.widths)} levels"
-        is_whole, name = self.pad_multiple % stride == 0, "config.model.pad_multiple"
-        require(is_whole, name, self.pad_multiple, expected)
+        is_whole = self.pad_multiple % stride == 0
+        require(is_whole, "config.model.pad_multiple", self.pad_multiple, expected)
         widths = {f"widths[{i}]": width for i, width in enumerate(self.widths)}
         widths["decoder_width"] = self.decoder_width
         if self.heads == "default":

@@ -114,7 +114,7 @@ def _transformer(
     return dinov3_hf.image_fields(vit), params
 
 
-def infer_fusion(tensors: StateDict, overrides: StateDict) -> dict[str, Any]:
+def infer_fusion(tensors: StateDict, overrides: Mapping[str, Any]) -> dict[str, Any]:
     """Infer fields of `config.model.fusion` from names and shapes, and apply the overrides."""
     has_weights = any(n.startswith("fusion.weighting_network.") for n in tensors)
     fields = {

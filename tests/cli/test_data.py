@@ -213,6 +213,11 @@ def test_points_of_two_disks(
         found = np.load(tmp_path / "found" / path.relative_to(expected))
         np.testing.assert_array_equal(found, np.load(path))
         assert found.shape[1] == 11
+    again = _run("points", radar, others, tensors, *words, code=2).output
+    assert again.startswith("error: ")
+    assert "would both be" in again
+    if release == "rpc":
+        assert "would both be" in _run("points", radar, "--out", radar, code=2).output
     words = ("--to", "pcd", "--method", "cfar", "--threshold-db", 3)
     _run("points", radar, others, *words, "--sequences", 1, "--out", tmp_path / "c")
     assert len(list((tmp_path / "c").glob("1/rpc_*.pcd"))) == 4

@@ -176,7 +176,11 @@ def test_score_evaluates_predictions_in_files(tmp_path: pathlib.Path) -> None:
     assert "100.0" in text.output
     assert (tmp_path / "out" / "metrics.json").is_file()
     assert json.loads(_run(*arguments, "--json").stdout)
-    for words, end in (((), ""), (("--roi", "wide", "--bootstrap", 0), "_roi_wide")):
+    for words, end in (
+        ((), ""),
+        (("--roi", "wide", "--bootstrap", 0), "_roi_wide"),
+        (("--z-offset", "0.5"), "_z_offset_m_0.5"),
+    ):
         text = _run("score", tmp_path / "kitti", *words).output
         assert text.endswith(f"Written to {tmp_path / 'kitti_evaluation'}{end}\n")
 

@@ -125,7 +125,7 @@ def test_corrupted_records_are_named(data, copy):
         ({"dtype": "int4"}, "dtype is 'int4'"),
         ({"shape": None}, "corrupted"),
         ({"source": 3}, "corrupted"),
-        ({"source": {}}, r"not the records of a radar \(KeyError: 'grid'"),
+        ({"source": {}}, r"not the records of a radar"),
         ({"source": {"grid": {}}}, "not the records of a radar"),
         ({"shape": [2, 3, 4]}, "arrays of shape"),
     ],

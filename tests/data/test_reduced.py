@@ -282,7 +282,9 @@ def test_a_model_is_for_one_form(found):
 
 
 def test_levels_of_a_projection_are_no_power():
-    levels = np.random.default_rng(0).uniform(0.45, 0.8, (2, *GRID.shape_drea[1:]))
-    levels = levels.transpose(0, 1, 3, 2)
+    grid = RadarGrid.reduced(
+        num_doppler=8, num_range=40, num_elevation=5, num_azimuth=7
+    )
+    levels = np.random.default_rng(0).uniform(0.45, 0.8, reduced.polar_shape(grid))
     with pytest.raises(DataError, match="expected linear power"):
-        project_reduced(levels, GRID)
+        project_reduced(levels, grid)

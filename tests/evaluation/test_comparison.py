@@ -114,6 +114,20 @@ def test_holm():
 
 
 @pytest.mark.parametrize("num_seeds", [1, 3])
+def test_a_single_class_in_one_sequence_is_not_tested(scene, num_seeds):
+    truth, found, frames = scene
+    sequence = dict(zip(frames["frame"], frames["sequence"], strict=True))
+    number = np.array([sequence[frame] for frame in truth["frame"]])
+    truth = {name: column[number == number[0]] for name, column in truth.items()}
+    for classes in (("Sedan",), CLASSES):
+        data = EvaluationSet(truth, found, classes=classes, frames=frames)
+        seeds = {f"seed{i}": data for i in range(num_seeds)}
+        for row in compare(seeds, seeds, frames, settings(classes=classes)):
+            assert np.isnan([row.low, row.high, row.p_adjusted]).all()
+            assert row.is_significant is None
+
+
+@pytest.mark.parametrize("num_seeds", [1, 3])
 def test_a_class_in_one_sequence_is_not_tested(scene, num_seeds):
     truth, found, frames = scene
     sequence = dict(zip(frames["frame"], frames["sequence"], strict=True))

@@ -72,6 +72,7 @@ def test_folders_are_named_after_options_that_change_numbers():
     changes |= {"roi": None, "classes": ("Sedan", "Bus or Truck"), "sequences": (5,)}
     expected = "_roi_None_classes_Sedan_Bus-or-Truck_sequences_5"
     assert name_of_changes(changes, usual) == expected
+    assert name_of_changes({"split": "/a/b c.txt"}, usual) == "_split_-a-b-c.txt"
 
 
 def test_weights_of_a_condition_give_the_condition(scene, data):

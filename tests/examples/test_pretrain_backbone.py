@@ -9,10 +9,9 @@ import pytest
 from click.testing import CliRunner
 
 from radejax import models
-from radejax.core.config import load_config
+from radejax.core.config import load_config, plain
 from radejax.core.structures import CLASSES
 from radejax.models.image import ResNetTrunk
-from radejax.simulation.config import plain
 from radejax.weights.image_backbone import load_image_backbone
 
 from .. import small_models as small

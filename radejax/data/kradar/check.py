@@ -144,7 +144,7 @@ def check_dataset(
         if is_kradar:
             _check_conditions(number, own, summary)
         row = _row(number, folder, own, splits)
-        rows.append(row | {"tesseracts_corrupted": corrupted[number]})
+        rows.append(row | {"radar_corrupted": corrupted[number]})
     names = [str(path) for path in data.roots]
     return HealthReport(
         names, data.version, rows, _count_objects(data, splits), summary
@@ -185,7 +185,7 @@ def _row(
         "images_missing": sum(frame.camera_path is None for frame in frames),
         "calibration": calibration,
         "tesseracts": len(_tensors(folder)),
-        "tesseracts_missing": sum(frame.radar_path is None for frame in frames),
+        "radar_missing": sum(frame.radar_path is None for frame in frames),
     }
 
 

@@ -17,7 +17,7 @@ from radejax.core.files import PathLike, as_path, atomic_write
 from radejax.data.kradar.dataset import find_release, find_sequences, read_grid
 from radejax.data.records import PreprocessReport
 from radejax.data.reduced import polar_shape, strongest_points
-from radejax.data.tesseract import read_polar
+from radejax.data.tesseract import check_axes, read_polar
 
 _LEFT_OUT = shutil.ignore_patterns("radar_tesseract", "DERA_tesseract", "records*")
 
@@ -44,7 +44,9 @@ def reduce_dataset(
     """
     require(0 < rate < 1, "rate", rate, "a number above 0 and below 1")
     began, out, paths = time.perf_counter(), as_path(out), list(map(as_path, roots))
+    require(out not in paths, "out", str(out), "another folder than the roots")
     grid, targets = read_grid(paths), {}
+    check_axes(grid)
     for folder in find_sequences(paths).values():
         for path in folder.listing("radar_tesseract").values():
             name = f"{release}_{path.stem.rpartition('_')[2]}.npy"

@@ -23,7 +23,7 @@ def test_healthy_copy(root):
     assert "no problems" in report.to_text()
     row = report.sequences[1]
     wanted = {"sequence": 2, "weather": "fog", "labels": 6, "train": 4, "test": 2}
-    wanted |= {"tesseracts": 6, "tesseracts_missing": 0, "tesseracts_corrupted": 0}
+    wanted |= {"tesseracts": 6, "radar_missing": 0, "radar_corrupted": 0}
     wanted |= {"calibration": "-2.5, 0.25"}
     assert {name: row[name] for name in wanted} == wanted
     rows = {(row["split"], row["weather"]): row for row in report.objects}
@@ -74,7 +74,7 @@ def test_everything_that_is_wrong_is_named(root):
     assert "tesseract_00007.mat: arrDREA has shape (2, 3, 4, 5), expected" in text
     assert "frame difference 9, but radar minus LiDAR" in text
     assert "1/00004_00001: the first of 1 frames that are in both" in text
-    assert report.sequences[0]["tesseracts_corrupted"] == 2
+    assert report.sequences[0]["radar_corrupted"] == 2
     assert f"{report.num_problems} problems" in text
 
 
@@ -110,7 +110,7 @@ def test_a_file_that_cannot_be_read_is_not_corrupted(root, monkeypatch):
     monkeypatch.setattr(check, "check_frame", fail)
     report = check_dataset(root)
     assert report.summary.problem_counts() == {"tesseract not readable": 12}
-    assert report.sequences[0]["tesseracts_corrupted"] == 0
+    assert report.sequences[0]["radar_corrupted"] == 0
 
 
 def test_a_part_that_is_not_there_is_wrong_use_and_no_clean_bill(root):

@@ -73,6 +73,8 @@ def test_writing_resumes_and_lists_corrupted_tensors(kradar_root, tmp_path):
     with pytest.raises(UserError, match=r"no radar_tesseract/\*\.mat in"):
         reduce_dataset([out], tmp_path / "again", "rpc")
     assert not (tmp_path / "again").exists()
+    with pytest.raises(UserError, match="expected another folder than the roots"):
+        reduce_dataset([source], source, "rpc")
 
 
 def test_points_of_another_rate_are_not_mixed(kradar_root, tmp_path):
