@@ -198,7 +198,7 @@ def strongest_points(
 def to_polar(
     frame: Real[np.ndarray, "..."], grid: RadarGrid, name: str = "frame"
 ) -> Polar:
-    """Returns a frame of a reduced release as `polar3d` array.
+    """Converts the data of one `polar3d` or `rpc` file to a `polar3d` array.
 
     Cells without a point have no power. Points `[N, 5]` at range 0 are left out.
 
@@ -215,7 +215,7 @@ def to_polar(
 
 
 def _with_direction(frame: Real[np.ndarray, "..."]) -> Real[np.ndarray, "..."]:
-    """Returns a frame without points `[N, 5]` whose range is 0."""
+    """Returns the data without points `[N, 5]` whose range is 0."""
     is_short = frame.ndim == 2 and frame.shape[1] == 5
     return frame[frame[:, :3].any(axis=1)] if is_short else frame
 

@@ -243,7 +243,7 @@ class Writer:
 
     @functools.cached_property
     def _sequence(self) -> Callable[[int], tuple[SequenceSimulator, Any]]:
-        """Function that makes the simulator and renderer of a sequence, with a cache."""
+        """Function that makes simulator and renderer by sequence number, with a cache."""
         return functools.lru_cache(maxsize=2)(self._make)
 
     def _make(self, number: int) -> tuple[SequenceSimulator, CameraRenderer | None]:
