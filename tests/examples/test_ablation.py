@@ -23,7 +23,7 @@ SKILL = {"sigma 3": 0.4, "model": 0.7, "sigma 0.75": 0.9, "shuffled labels": 0.1
 """Fraction of the objects that a cell detects; 0.5 by default."""
 
 
-NOT_MEASURED = {"releases", "polar3d_camera"}
+NOT_MEASURED = {"polar3d_camera"}
 """Tables whose runs have not been made."""
 
 GRID = {"doppler": 4, "range": 32, "elevation": 5, "azimuth": 28}
