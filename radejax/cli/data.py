@@ -15,6 +15,19 @@ from radejax.core.errors import DataError, UserError
 _new_root = click.option(
     "--out", required=True, type=entry.FOLDER, help="Root of the new dataset."
 )
+_rate = click.option(
+    "--rate",
+    type=entry.FRACTION,
+    default=0.01,
+    help="Fraction of the cells that become points.",
+)
+
+
+def _echo_report(report: Any) -> None:
+    """Prints a `PreprocessReport`; the exit code is 1 if frames were skipped."""
+    click.echo(report.to_text())
+    if report.skipped:
+        raise SystemExit(entry.FAILED)
 
 
 @click.command(cls=entry.Command)
@@ -146,9 +159,7 @@ def preprocess(
     report = records.preprocess(
         frames, out, dtype=dtype, shard=shard, num_workers=num_workers
     )
-    click.echo(report.to_text())
-    if report.skipped:
-        raise SystemExit(entry.FAILED)
+    _echo_report(report)
 
 
 @click.command(cls=entry.Command)
@@ -161,12 +172,7 @@ def preprocess(
     type=click.Choice(["polar3d", "rpc"]),
     help="polar3d: mean power and Doppler of every cell. rpc: the strongest cells.",
 )
-@click.option(
-    "--rate",
-    type=entry.FRACTION,
-    default=0.01,
-    help="Fraction of the cells (rpc only).",
-)
+@_rate
 def reduce(roots: tuple[str, ...], out: pathlib.Path, **options: Any) -> None:
     """Write the files of K-Radar's reduced releases from radar tensors.
 
@@ -177,10 +183,7 @@ def reduce(roots: tuple[str, ...], out: pathlib.Path, **options: Any) -> None:
     """
     from radejax.data.kradar.reduce import reduce_dataset
 
-    report = reduce_dataset(roots, out, **options)
-    click.echo(report.to_text())
-    if report.skipped:
-        raise SystemExit(entry.FAILED)
+    _echo_report(reduce_dataset(roots, out, **options))
 
 
 @click.command(cls=entry.Command)
@@ -199,12 +202,7 @@ def reduce(roots: tuple[str, ...], out: pathlib.Path, **options: Any) -> None:
     default="percentile",
     help="percentile: the strongest cells. cfar: bins that exceed their neighborhood.",
 )
-@click.option(
-    "--rate",
-    type=entry.FRACTION,
-    default=0.01,
-    help="Fraction of the cells (percentile only).",
-)
+@_rate
 @click.option(
     "--threshold-db",
     type=entry.DECIBELS,
@@ -259,10 +257,7 @@ def points(
             continue
         write_points(target, cloud)
     seconds = time.perf_counter() - began
-    report = PreprocessReport(len(frames), 0, skipped, seconds)
-    click.echo(report.to_text())
-    if skipped:
-        raise SystemExit(entry.FAILED)
+    _echo_report(PreprocessReport(len(frames), 0, skipped, seconds))
 
 
 @click.command(cls=entry.Command)

@@ -71,11 +71,13 @@ def check_release(found: str | None, expected: str | None, name: str) -> None:
         name: Name of the data in the message.
     """
     if found != expected:
-        option = f"the option {found}" if found else "no option for a reduced release"
+        option = (
+            f"with the option {found}" if found else f"without the option {expected}"
+        )
         raise UserError(
             f"{name}: {found or 'radar tensors'}, but the model is for "
             f"{expected or 'radar tensors'} (config.data.release is {expected}); use data "
-            f"of that form, or train with {option}, such as --config radenet:{found or ''}"
+            f"of that form, or train {option} of the configs radenet and dinorade"
         )
 
 
