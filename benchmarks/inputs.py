@@ -74,17 +74,17 @@ def frames_of(size, **camera):
     )
 
 
-def simulator_of(count, weather="rain"):
-    """Returns inputs of the simulated radar for frames of a scene, and the simulating function."""
+def simulator_of(weather="rain"):
+    """Returns the arrays of one frame of the simulated radar, and the simulating function."""
     config = SimulationConfig.from_mapping(default_config() | FULL_SIZE)
     sequence = make_sequence(
-        1, environment="urban", time="day", weather=weather, num_frames=count,
+        1, environment="urban", time="day", weather=weather, num_frames=1,
         rng=np.random.default_rng(len(weather)),
     )  # fmt: skip
     grid, parameters = config.make_grid(), config.make_parameters()
     simulator = SequenceSimulator(sequence, grid, parameters, seed=0)
-    inputs = [simulator.radar_input(sequence.frame(i)) for i in range(count)]
-    return inputs, functools.partial(tensor.simulate, grid=grid, parameters=parameters)
+    arrays = simulator.radar_input(sequence.frame(0)).arrays
+    return arrays, functools.partial(tensor.simulate, grid=grid, parameters=parameters)
 
 
 # Records -----------------------------------------------------------------------------

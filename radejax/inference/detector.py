@@ -171,6 +171,7 @@ class Detector:
         self._lock = threading.Lock()
         # Every process gets all detections: they are small.
         self._run = jax.jit(self.detect_function(), out_shardings=self.replicated)
+        self._extremes = jax.jit(_extremes, out_shardings=self.replicated)
 
     @classmethod
     def from_workdir(
@@ -278,15 +279,18 @@ class Detector:
                 expected.
         """
         inputs: Any
-        if isinstance(frames, Batch):  # its content was checked when it was created
+        is_checked = True  # the content of a batch was checked when it was created
+        if isinstance(frames, Batch):
             inputs = frames.projection, frames.image, frames.camera
         else:
-            radar = self._read(frames, self.num_frames)
+            release = self.saved.config.data.get("release")
+            radar = radar_batch(frames, self.grid, self.num_frames, release)
             if self.num_frames > 1:
                 shape = (-1, self.num_frames, *self.grid.projection_shape)
-                projections = _projections(radar, self.grid).reshape(shape)
-                samples = np.moveaxis(projections, 1, 0)
+                samples = np.moveaxis(self._projections(radar).reshape(shape), 1, 0)
                 radar = stack_frames(list(samples), self.grid.num_doppler)
+            else:
+                is_checked = not isinstance(radar, np.ndarray)
             image, camera, num_radar_only = camera_batch(
                 image, camera, len(radar), self.model, self.camera_options
             )
@@ -301,25 +305,18 @@ class Detector:
         largest = self._batch_sizes[-1]
         for start in range(0, len(inputs[0]), largest):
             chunk = jax.tree.map(lambda x, s=start: x[s : s + largest], inputs)
-            parts.append(self._detect(chunk, settings))
+            parts.append(self._detect(chunk, settings, is_checked))
         if len(parts) == 1:
             return parts[0]
         return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
-    def _read(self, frames: Frames, num_frames: int) -> Real[Any, "B ..."]:
-        """Return the frames of samples as one array, and count invalid ones."""
-        release = self.saved.config.data.get("release")
-        radar = radar_batch(frames, self.grid, num_frames, release)
-        num_invalid = count_invalid(radar, warn=not self.num_invalid_frames)
-        with self._lock:
-            self.num_invalid_frames += num_invalid
-        return radar
-
-    def _detect(self, inputs: Any, settings: Any) -> Detections:
+    def _detect(self, inputs: Any, settings: Any, is_checked: bool) -> Detections:
         """Detect objects in at most as many frames as the largest batch size."""
         count = inputs[0].shape[0]
         size = next(size for size in self._batch_sizes if size >= count)
         inputs = jax.tree.map(lambda x: self.put(_padded(x, size)), inputs)
+        if not is_checked:
+            self._count_invalid(inputs[0], count)
         found = self._run(self.variables, *inputs, settings)
         if jax.default_backend() == "cpu" and len(self.sharding.device_set) > 1:
             # With several batches in flight, CPU devices that share cores can fail to
@@ -327,6 +324,40 @@ class Detector:
             jax.block_until_ready(found)
         found = found.replace(class_names=self.classes)
         return found if count == size else jax.tree.map(lambda x: x[:count], found)
+
+    def _count_invalid(self, frames: Real[jax.Array, "B ..."], count: int) -> None:
+        """Count invalid frames among the first `count`, and warn of the first ones.
+
+        Invalid are values that cannot be linear power or levels of a projection, see
+        `find_problem`. In uint8, every value is a valid level.
+        """
+        if frames.dtype == jnp.uint8:
+            return
+        extremes = (x[:count] for x in jax.device_get(self._extremes(frames)))
+        problems = map(functools.partial(_find_problem, frames.ndim - 1), *extremes)
+        found = list(filter(None, problems))
+        if found and not self.num_invalid_frames:
+            _log.warning(
+                "%d of %d frames are not linear power or its projection: %s. Their "
+                "detections are meaningless; further ones are counted in "
+                "num_invalid_frames",
+                len(found),
+                count,
+                found[0],
+            )
+        with self._lock:
+            self.num_invalid_frames += len(found)
+
+    def _projections(
+        self, radar: Real[Array, "B ..."]
+    ) -> Float[np.ndarray, "B R A DE"]:
+        """Compute float32 projections of any radar data, and count invalid NumPy arrays."""
+        placed = jnp.asarray(radar)
+        if isinstance(radar, np.ndarray):
+            self._count_invalid(placed, len(placed))
+        if placed.ndim == 5:
+            placed = self.grid.measured_channels(project_jax(placed))
+        return np.asarray(to_float(placed))
 
     def stream(self, frames: Iterable[Any], **settings: Any) -> Iterator[Detections]:
         """Yield the detections of items in order, with up to two items in flight.
@@ -364,12 +395,14 @@ class Detector:
             frames: Single frames as arrays or paths.
             history: The last T - 1 projections, or None before the first frame.
         """
-        new, past = _projections(self._read(frames, 1), self.grid), self.num_frames - 1
+        release = self.saved.config.data.get("release")
+        new = self._projections(radar_batch(frames, self.grid, release=release))
+        past = self.num_frames - 1
         if history is None:
             history = np.repeat(new[:1], past, axis=0)
         known = np.concatenate([history, new])
         rows = np.arange(len(new))[:, None] + np.arange(self.num_frames)
-        # `count_invalid` counts the frames of NumPy arrays, which is done already.
+        # Invalid frames were counted; those of arrays on a device are not counted again.
         return jnp.asarray(known[rows]), known[-past:]
 
     def warmup(self, *sample: Any) -> Detector:
@@ -415,15 +448,6 @@ class Detector:
         x = x.copy() if is_cpu else x
         placed = jax.make_array_from_process_local_data(self.sharding, x)
         return placed if is_cpu else jax.block_until_ready(placed)
-
-
-def _projections(
-    radar: Real[Array, "B ..."], grid: RadarGrid
-) -> Float[np.ndarray, "B R A DE"]:
-    """Compute the float32 projections of tesseracts, or convert stored projections."""
-    if radar.ndim == 5:
-        radar = grid.measured_channels(project_jax(radar))
-    return np.asarray(to_float(radar))
 
 
 def _padded(x: Shaped[Array, "b ..."], size: int) -> Shaped[Array, "{size} ..."]:
@@ -542,39 +566,29 @@ def _projected(frames: Any, grid: RadarGrid, release: str | None) -> Any:
     return array
 
 
-def count_invalid(frames: Real[Any, "B ..."], *, warn: bool) -> int:
-    """Count the frames whose values cannot be linear power or levels of a projection.
+def _extremes(
+    frames: Real[jax.Array, "B ..."],
+) -> tuple[Float[jax.Array, " B"], Real[jax.Array, "B _ _"]]:
+    """Compute the smallest value of each frame, and its maximum over range (and Doppler).
 
-    Arrays on a device are not checked (see `find_problem` for what is), and neither are
-    uint8 arrays, in which every value is a valid level.
-
-    Args:
-        frames: Projections or tesseracts.
-        warn: Log a warning if there are such frames.
+    The smallest value is -inf if the frame contains NaN or values below the valid ones. On
+    a CPU, the compiler's minimum and maximum can ignore NaN, but comparisons do not.
     """
-    if not isinstance(frames, np.ndarray) or frames.dtype == np.uint8:
-        return 0
-    problems = [_find_problem(frame) for frame in frames]
-    count = len(problems) - problems.count(None)
-    if count and warn:
-        _log.warning(
-            "%d of %d frames are not linear power or its projection: %s. Their detections "
-            "are meaningless; further ones are counted in num_invalid_frames",
-            count,
-            len(frames),
-            next(filter(None, problems)),
-        )
-    return count
+    axes, least = tuple(range(1, frames.ndim)), -MAX_LEVEL if frames.ndim == 4 else 0
+    is_valid = (frames >= least).all(axes)
+    lowest = jnp.where(is_valid, frames.min(axes).astype(jnp.float32), -jnp.inf)
+    return lowest, frames.max(axis=1 if frames.ndim == 4 else (1, 2))
 
 
-def _find_problem(frame: Real[np.ndarray, "..."]) -> str | None:
-    """Describe why a projection or tesseract is not valid; None if it is."""
-    lowest = float(frame.min())
-    if frame.ndim == 3:
-        return find_problem(frame.max(axis=0), 0.0 if lowest >= -MAX_LEVEL else -1.0)
+def _find_problem(
+    num_axes: int, lowest: Real[np.ndarray, ""], beams: Real[np.ndarray, "_ _"]
+) -> str | None:
+    """Describe why a frame of 3 axes (projection) or 4 is not valid; None if it is."""
+    beams = beams.astype(np.float64)
+    if num_axes == 3:
+        return find_problem(beams, -1.0 if np.isneginf(lowest) else 0.0)
     with np.errstate(invalid="ignore"):  # the logarithm of a negative maximum
-        beams = to_log_scale(frame.max(axis=(0, 1)).astype(np.float64))
-    return find_problem(beams, lowest)
+        return find_problem(to_log_scale(beams), float(lowest))
 
 
 def camera_batch(

@@ -234,6 +234,15 @@ def test_invalid_frames_are_counted_and_warned_of_once(
     )
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1.0])
+def test_one_invalid_cell_of_a_tesseract_is_found(detector, tesseracts, value):
+    detector = detector.replace(batch_sizes=(4,))
+    frames = tesseracts[:3].copy()
+    frames[2, 1, 3, 2, 5] = value
+    detector(frames)
+    assert detector.num_invalid_frames == 1
+
+
 def test_decibels_are_warned_of(detector, tesseracts, projections, caplog):
     detector = detector.replace(batch_sizes=(4,))
     decibels = 10.0 * np.log10(tesseracts[:2])
