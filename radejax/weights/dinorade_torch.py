@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any
 
 from radejax import models
 from radejax.core.config import load_config
 from radejax.core.errors import DataError, require
 from radejax.core.files import PathLike
-from radejax.models.dinorade import IMAGE_BACKBONE, DinoRade
+from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.weights import convert, dinov3_hf, radenet_torch
 from radejax.weights.convert import Rules, StateDict
 from radejax.weights.image_backbone import RESNET_RULES
@@ -27,48 +27,37 @@ PART = "rad_backbone."
 _UNUSED = r"rad_backbone\.cbam_|fusion\.output_proj\."
 
 
-def load(
-    state_dict_or_path: StateDict | PathLike,
-    *,
-    dinov3: PathLike | None = None,
-    **model_overrides: Any,
-) -> tuple[DinoRade, dict[str, Any]]:
-    """Load model and variables from an official checkpoint, with the released geometry.
-
-    The camera is `CameraCalibration.from_kradar(file,
-    radar_from_lidar_m=OFFICIAL_OFFSET_M).camera("pinhole")`, see `radejax.models.lifting`.
-    The maps include the padding; their grid for official weights is
-    `RadarGrid.kradar().padded(8, "stretched")`.
-
-    Args:
-        state_dict_or_path: Tensors by name, or a file, see `convert.read_state_dict`.
-        dinov3: Folder of a DINOv3 that replaces the checkpoint's image backbone, if it has
-            one. Without any backbone, the model accepts only embedded images.
-        **model_overrides: Fields of `config.model` or `config.model.fusion`, which replace
-            those inferred from names and shapes and the defaults.
-
-    Returns:
-        The model, and `{"params": ..., "batch_stats": ...}` in float32.
-
-    Raises:
-        FileNotFoundError: The checkpoint, the folder or a file in it is missing.
-        UserError: An override is unknown or invalid, `doppler_bins` and `elevation_bins`
-            are needed and missing, or the folder contains another kind of model.
-        DataError: A file is corrupted, or tensors are missing, unexpected or of another
-            shape. The message lists up to 20 of them.
-    """
-    tensors, source = convert.read_state_dict(state_dict_or_path, PART)
-    config, variables = read(tensors, source, dinov3, **model_overrides)
-    return cast(DinoRade, models.build(config)), variables
-
-
 def read(
     tensors: StateDict,
     source: str,
     dinov3: PathLike | None = None,
     **model_overrides: Any,
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return `config.model` and variables for tensors by official name; see `load`."""
+    """Return `config.model` and the variables of tensors by official name.
+
+    The geometry is the released one. The camera is `CameraCalibration.from_kradar(file,
+    radar_from_lidar_m=OFFICIAL_OFFSET_M).camera("pinhole")`, see `radejax.models.lifting`.
+    The maps include the padding; their grid for official weights is
+    `RadarGrid.kradar().padded(8, "stretched")`.
+
+    Args:
+        tensors: Tensors by official name, see `convert.read_state_dict`.
+        source: Name of the tensors in error messages.
+        dinov3: Folder of a DINOv3 that replaces the checkpoint's image backbone, if it has
+            one. Without any backbone, the model accepts only embedded images.
+        **model_overrides: Fields of `config.model` or `config.model.fusion`, which replace
+            those inferred from names and shapes and the defaults.
+
+    Returns:
+        The fields of `config.model`, and `{"params": ..., "batch_stats": ...}` in float32.
+
+    Raises:
+        FileNotFoundError: The folder or a file in it is missing.
+        UserError: An override is unknown or invalid, `doppler_bins` and `elevation_bins`
+            are needed and missing, or the folder contains another kind of model.
+        DataError: A file is corrupted, or tensors are missing, unexpected or of another
+            shape. The message lists up to 20 of them.
+    """
     tensors = without_lora(tensors)
     config = load_config("dinorade:official").model.to_dict()
     fusion = config["fusion"]

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from radejax import models
 from radejax.core.config import load_config
 from radejax.core.errors import DataError, UserError
-from radejax.core.files import PathLike
 from radejax.models.radenet import RadeNet
 from radejax.weights import convert
 from radejax.weights.convert import Rules, StateDict
@@ -22,40 +21,30 @@ PART = "backbone."
 _UNUSED_CBAM = r"(rad_)?backbone\.cbam_"  # official models without CBAM have them too
 
 
-def load(
-    state_dict_or_path: StateDict | PathLike, **model_overrides: Any
-) -> tuple[RadeNet, dict[str, Any]]:
-    """Load model and variables from an official checkpoint.
+def read(
+    tensors: StateDict, source: str, **model_overrides: Any
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return `config.model` and the variables of tensors by official name.
 
     The maps include the padding; their grid for official weights is
     `RadarGrid.kradar().padded(8, "stretched")`.
 
     Args:
-        state_dict_or_path: NumPy or torch arrays by name, or a file, see
-            `convert.read_state_dict`.
+        tensors: Tensors by official name, see `convert.read_state_dict`.
+        source: Name of the tensors in error messages.
         **model_overrides: Fields of `config.model`, which replace those inferred from names
             and shapes and the defaults. `cbam=None` is needed for released models without
             CBAM, as they contain its tensors, and `num_groups` for other than 32 groups.
 
     Returns:
-        The model, and `{"params": ...}` with float32 arrays.
+        The fields of `config.model`, and `{"params": ...}` with float32 arrays.
 
     Raises:
-        FileNotFoundError: There is no such file.
         UserError: An override is unknown or invalid, or `doppler_bins` and `elevation_bins`
             are needed and missing, see `infer_config`.
-        DataError: The file is corrupted, or tensors are missing, unexpected or of another
-            shape. The message lists up to 20 of them.
+        DataError: Tensors are missing, unexpected or of another shape. The message lists up
+            to 20 of them.
     """
-    tensors, source = convert.read_state_dict(state_dict_or_path, PART)
-    config, variables = read(tensors, source, **model_overrides)
-    return cast(RadeNet, models.build(config)), variables
-
-
-def read(
-    tensors: StateDict, source: str, **model_overrides: Any
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return `config.model` and variables for tensors by official name; see `load`."""
     config = load_config("radenet:official").model.to_dict()
     config |= infer_config(tensors, source, model_overrides)
     shapes = convert.variable_shapes(models.build(config))
@@ -64,7 +53,7 @@ def read(
 
 
 def save(model: RadeNet, variables: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return a state dict that the official code can load; this is the inverse of `load`.
+    """Return a state dict that the official code can load; this is the inverse of `read`.
 
     To write a file, use `safetensors.numpy.save_file(state, path)`, or `torch.save` after
     `torch.from_numpy` of every array.

@@ -10,6 +10,7 @@ import safetensors.numpy
 from radejax.data.kradar import KRadar, conditions, dataset, labels, write
 from radejax.data.tesseract import project_file, read_projection_npy
 from radejax.geometry.camera import CameraCalibration
+from radejax.inference.saved import load_torch
 from radejax.weights import radenet_torch
 
 from .. import small_models as small
@@ -83,7 +84,7 @@ def _weights(folder: Folder, suffix: str) -> None:
 
 def _read_weights(folder: Folder, suffix: str) -> None:
     bins = {"doppler_bins": 2, "elevation_bins": 3}
-    radenet_torch.load(folder / f"a{suffix}", num_groups=4, **bins)
+    load_torch(folder / f"a{suffix}", num_groups=4, **bins)
 
 
 def _of_root(read: object, path: str) -> Reader:

@@ -21,6 +21,7 @@ from radejax.core.config import load_module
 from radejax.core.structures import CLASSES, Batch, DetectionMaps
 from radejax.geometry.camera import CameraCalibration, stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
+from radejax.inference.saved import load_torch
 from radejax.models.lifting import OFFICIAL_OFFSET_M
 from radejax.training import distributed
 from radejax.training.loop import loss_options
@@ -31,7 +32,7 @@ from radejax.training.step import (
     make_schedule,
     make_train_step,
 )
-from radejax.weights import dinorade_torch, dinov3_hf, radenet_torch
+from radejax.weights import dinov3_hf, radenet_torch
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
 SEED = 1234
@@ -146,7 +147,7 @@ def test_radenet_trains_as_released(
         n: make.seeded_tensor(n, s)
         for n, s in radenet_torch.torch_shapes(model).items()
     }
-    _, variables = radenet_torch.load(tensors)
+    variables = load_torch(tensors).variables
     state, measured = train(config, model, variables, frames, 12)
     maps = jax.jit(model.apply)(state.eval_variables, frames.projection[:1])
     with np.load(shared / "fixtures/trajectory/radenet_official.npz") as fixture:
@@ -222,7 +223,7 @@ def test_dinorade_trains_as_released(
     config.train.final_learning_rate = config.train.learning_rate
     model = models.build(config.model)
     tensors = seeded(shared, make, "dinorade/end_to_end")
-    _, variables = dinorade_torch.load(tensors)
+    variables = load_torch(tensors).variables
     backbone = dinov3_hf.to_params(model.vit, seeded(shared, make, "dinov3/vits16"))
     variables["params"]["image_backbone"] = backbone
     calibration = CameraCalibration.from_kradar(
@@ -244,7 +245,7 @@ def test_dinorade_trains_as_released(
     check_maps(maps, fixture, heatmap=4e-3, regression=0.1)
 
     after = jax.device_get({"params": state.params, **state.model_state})
-    trained = by_torch_name(lambda x: dinorade_torch.load(x)[1], tensors, after)
+    trained = by_torch_name(lambda x: load_torch(x).variables, tensors, after)
     left_out = {name for name in tensors if name not in trained}
     assert all("num_batches" in n or "fusion.output_proj" in n for n in left_out)
     running = [name for name in trained if ".running_" in name]

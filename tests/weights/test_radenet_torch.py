@@ -16,6 +16,7 @@ import safetensors.numpy
 
 from radejax import models
 from radejax.core.errors import DataError, UserError
+from radejax.inference.saved import load_torch
 from radejax.models.radenet import RadeNet
 from radejax.weights import radenet_torch
 from radejax.weights.convert import torch_name
@@ -36,6 +37,12 @@ def small_state(recipe):
     return recipe["seeded_state"](torch_shapes(model))
 
 
+def load(content, **options):
+    """Model and variables of an official checkpoint."""
+    saved = load_torch(content, **options)
+    return saved.model, saved.variables
+
+
 OVERRIDES = {"num_groups": 8, "doppler_bins": 8, "elevation_bins": 5}
 
 
@@ -44,7 +51,7 @@ def load_variant(recipe, variant):
     model = models.build(config)
     state = recipe["seeded_state"](torch_shapes(model))
     overrides = OVERRIDES | ({"cbam": "paper"} if variant == "paper" else {})
-    return model, *radenet_torch.load(state, **overrides)
+    return model, *load(state, **overrides)
 
 
 @pytest.mark.parametrize("variant", ["model", "base", "stem", "expand", "paper"])
@@ -79,14 +86,14 @@ def test_small_gradients_equal_torchs(recipe, golden):
 
 
 def test_save_is_the_inverse_of_load(small_state):
-    model, variables = radenet_torch.load(small_state, **OVERRIDES)
+    model, variables = load(small_state, **OVERRIDES)
     saved = radenet_torch.save(model, variables)
     assert saved.keys() == small_state.keys()
     chex.assert_trees_all_equal(saved, small_state)
 
 
 def test_an_input_that_the_official_code_would_not_see_is_not_saved(small_state):
-    model, variables = radenet_torch.load(
+    model, variables = load(
         small_state, **OVERRIDES | {"input_center": 0.545, "input_scale": 25.0}
     )
     with pytest.raises(UserError, match=r"input_center=0\.545 and input_scale=25\.0"):
@@ -95,20 +102,20 @@ def test_an_input_that_the_official_code_would_not_see_is_not_saved(small_state)
 
 @pytest.mark.parametrize("ending", [".pth", ".safetensors"])
 def test_files_of_every_kind_come_back(small_state, tmp_path, ending):
-    model, variables = radenet_torch.load(small_state, **OVERRIDES)
+    model, variables = load(small_state, **OVERRIDES)
     path = tmp_path / f"weights{ending}"
     if ending == ".pth":  # as torch writes it, which is not needed
         write_pth(path, small_state)
     else:
         safetensors.numpy.save_file(radenet_torch.save(model, variables), path)
-    again, loaded = radenet_torch.load(path, **OVERRIDES)
+    again, loaded = load(path, **OVERRIDES)
     assert again == model
     chex.assert_trees_all_equal(loaded, variables)
 
 
 def test_torch_loads_what_was_saved(small_state, tmp_path):
     torch = pytest.importorskip("torch")
-    saved = radenet_torch.save(*radenet_torch.load(small_state, **OVERRIDES))
+    saved = radenet_torch.save(*load(small_state, **OVERRIDES))
     tensors = {name: torch.from_numpy(value) for name, value in saved.items()}
     torch.save(tensors, tmp_path / "weights.pth")
     loaded = torch.load(tmp_path / "weights.pth", weights_only=True)
@@ -119,8 +126,8 @@ def test_torch_loads_what_was_saved(small_state, tmp_path):
 def test_torch_tensors_are_taken_as_they_are(small_state):
     torch = pytest.importorskip("torch")
     tensors = {n: torch.tensor(v, requires_grad=True) for n, v in small_state.items()}
-    _, variables = radenet_torch.load(tensors, **OVERRIDES)
-    _, expected = radenet_torch.load(small_state, **OVERRIDES)
+    _, variables = load(tensors, **OVERRIDES)
+    _, expected = load(small_state, **OVERRIDES)
     chex.assert_trees_all_equal(variables, expected)
 
 
@@ -129,14 +136,14 @@ def test_torch_tensors_are_taken_as_they_are(small_state):
 def test_nested_and_prefixed_checkpoints(small_state, prefix, key):
     state = {prefix + name: value for name, value in small_state.items()}
     checkpoint = state if key is None else {"epoch": 3, key: state, "optimizer": {}}
-    _, variables = radenet_torch.load(checkpoint, **OVERRIDES)
-    _, expected = radenet_torch.load(small_state, **OVERRIDES)
+    _, variables = load(checkpoint, **OVERRIDES)
+    _, expected = load(small_state, **OVERRIDES)
     chex.assert_trees_all_equal(variables, expected)
 
 
 def test_several_state_dicts_are_not_guessed_at(small_state):
     with pytest.raises(DataError, match=r"expected one state dict .*, found 2"):
-        radenet_torch.load({"model": small_state, "ema": small_state})
+        load({"model": small_state, "ema": small_state})
 
 
 def test_all_problems_are_listed(small_state):
@@ -146,7 +153,7 @@ def test_all_problems_are_listed(small_state):
     name = "backbone.encoder_block_2.double_conv.0.single_conv.0.weight"
     state[name] = np.zeros((31, 16, 3, 3), np.float32)
     with pytest.raises(DataError) as error:
-        radenet_torch.load(state, **OVERRIDES)
+        load(state, **OVERRIDES)
     message = str(error.value)
     assert "4 problems" in message
     assert "missing neck.neck.1.gn.bias" in message
@@ -156,7 +163,7 @@ def test_all_problems_are_listed(small_state):
 
 
 def test_released_models_without_cbam_still_have_its_tensors(small_state, recipe):
-    model, variables = radenet_torch.load(small_state, cbam=None, **OVERRIDES)
+    model, variables = load(small_state, cbam=None, **OVERRIDES)
     assert model.cbam is None
     assert not any("cbam" in name for name in variables["params"]["backbone"])
     saved = radenet_torch.save(model, variables)
@@ -177,26 +184,29 @@ def test_paper_cbam_has_no_official_form(recipe):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ({"a": 1}, r"expected one state dict with tensors backbone\.\*, found 0"),
+        (
+            {"a": 1},
+            r"tensors backbone\.\* or rad_backbone\.\*, found 0",
+        ),
         ([1, 2], r"found 0"),
         ({"backbone.fc.weight": np.zeros(3)}, r"not a state dict of RADE-Net"),
     ],
 )
 def test_something_else_is_rejected(content, message):
     with pytest.raises(DataError, match=message):
-        radenet_torch.load(content)
+        load(content)
 
 
 def test_overrides_are_checked(small_state):
     with pytest.raises(UserError, match="width is not a field of this model"):
-        radenet_torch.load(small_state, width=3, **OVERRIDES)
+        load(small_state, width=3, **OVERRIDES)
     with pytest.raises(UserError, match=r"give doppler_bins and elevation_bins"):
-        radenet_torch.load(small_state, num_groups=8)
+        load(small_state, num_groups=8)
 
 
 def test_missing_file(tmp_path):
     with pytest.raises(FileNotFoundError):
-        radenet_torch.load(tmp_path / "none.pth")
+        load(tmp_path / "none.pth")
 
 
 # The official network at full size ---------------------------------------------------
@@ -208,7 +218,7 @@ def load_official(shared, recipe, variant):
     )
     shapes = {e["name"]: tuple(e["shape"]) for e in listing["tensors"]}
     overrides = {"cbam": None} if variant in ("base", "no_cbam") else {}
-    return radenet_torch.load(recipe["seeded_state"](shapes), **overrides)
+    return load(recipe["seeded_state"](shapes), **overrides)
 
 
 def official_input():
@@ -287,7 +297,7 @@ def test_another_block_is_an_error(small_state):
     name = "backbone.encoder_block_100000000.adjust_input.weight"
     state[name] = np.zeros((1, 1, 1, 1), np.float32)
     with pytest.raises(DataError, match=r"without a tensor .*encoder_block_4"):
-        radenet_torch.load(state, **OVERRIDES)
+        load(state, **OVERRIDES)
 
 
 # Names ------------------------------------------------------------------------------
