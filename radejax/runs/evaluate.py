@@ -10,7 +10,6 @@ import pathlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-import jax
 import numpy as np
 from matplotlib.figure import Figure
 from ml_collections import ConfigDict
@@ -54,7 +53,6 @@ class Evaluation:
         data: Data to evaluate on.
         split: "test", "validation", "train", "all" or the path of a split file.
         shuffle_images: Seed for shuffling the images, or None; see `evaluate_run`.
-        mesh: Devices for the predictions; all devices if None.
         **changes: Fields of `EvaluationOptions` to replace.
 
     Raises:
@@ -68,7 +66,6 @@ class Evaluation:
         split: str = "test",
         *,
         shuffle_images: int | None = None,
-        mesh: jax.sharding.Mesh | None = None,
         **changes: Any,
     ) -> None:
         self._config, self._data, self._split = config, data, split
@@ -82,7 +79,7 @@ class Evaluation:
         self._truth, self._table = tables_from_frames(self._frames, split)
         self._detector = Detector(
             SavedModel(config, data.records.grid, {}),
-            distributed.batch_sharding(mesh or distributed.make_mesh()),
+            distributed.batch_sharding(distributed.make_mesh()),
             score_threshold=self._options.min_score,
         )
 

@@ -1,6 +1,7 @@
 """Predictions and scores of a dataset: the same on one device and on eight."""
 
 from types import SimpleNamespace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -60,7 +61,8 @@ def setup(tmp_path_factory):
 
 def _predict(setup, num_devices):
     mesh = distributed.make_mesh(num_devices)
-    evaluation = Evaluation(setup.config, setup.data, mesh=mesh)
+    with mock.patch.object(distributed, "make_mesh", return_value=mesh):
+        evaluation = Evaluation(setup.config, setup.data)
     return evaluation.predict(setup.variables, progress=False)
 
 
@@ -119,5 +121,6 @@ def test_scores_during_training_name_their_protocol(setup):
     assert means == [scores.best]
     assert len(scores.figures) == 1
     mesh = distributed.make_mesh(1)
-    alone = Evaluation(setup.config, setup.data, mesh=mesh).validate(setup.variables)
+    with mock.patch.object(distributed, "make_mesh", return_value=mesh):
+        alone = Evaluation(setup.config, setup.data).validate(setup.variables)
     assert alone.values == pytest.approx(scores.values)
