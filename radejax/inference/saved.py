@@ -313,27 +313,12 @@ def _with_backbone(saved: SavedModel, given: PathLike | None) -> SavedModel:
 # Weights that a training starts from -------------------------------------------------
 
 
-@dataclasses.dataclass(frozen=True)
-class StartingWeights:
-    """Weights that a training starts from instead of random ones.
-
-    Attributes:
-        variables: Variables of the whole model; None to initialize them randomly.
-        pretrained: Part of the variables that replaces initialized ones, or None.
-        frozen_sha256: Checksum of the frozen image backbone; None if there is none.
-    """
-
-    variables: Mapping[str, Any] | None = None
-    pretrained: Mapping[str, Any] | None = None
-    frozen_sha256: str | None = None
-
-
 def starting_weights(
     config: Any,
     init_from: PathLike | None = None,
     image_backbone_path: PathLike | None = None,
     embeddings_sha256: str | None = None,
-) -> StartingWeights:
+) -> tuple[Mapping[str, Any] | None, Mapping[str, Any] | None, str | None]:
     """Read the weights that a training starts from, including frozen ones.
 
     Args:
@@ -344,6 +329,11 @@ def starting_weights(
             `image_backbone.load_image_backbone`.
         embeddings_sha256: Checksum of the weights with which `radejax embed` computed the
             embeddings that replace the frozen backbone; None without embeddings.
+
+    Returns:
+        Variables of the whole model, or None to initialize them randomly; the part of the
+        variables that replaces initialized ones, or None; and the checksum of the frozen
+        image backbone, or None if there is none.
 
     Raises:
         UserError: The weights do not fit the model; the message names the differences.
@@ -361,7 +351,7 @@ def starting_weights(
         digest = embeddings_sha256 or image_backbone.weights_sha256(
             given["params"][IMAGE_BACKBONE]
         )
-    return StartingWeights(variables, pretrained, digest)
+    return variables, pretrained, digest
 
 
 def _fitting_variables(path: PathLike, config: Any) -> Mapping[str, Any]:

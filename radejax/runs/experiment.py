@@ -39,11 +39,7 @@ from radejax.data.dataset import FrameSequence
 from radejax.data.records import open_embeddings
 from radejax.evaluation.report import Table, number, numbers, write_tables
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.inference.saved import (
-    FROZEN_BACKBONE,
-    StartingWeights,
-    starting_weights,
-)
+from radejax.inference.saved import FROZEN_BACKBONE, starting_weights
 from radejax.runs import checks
 from radejax.runs.data import located, open_data
 from radejax.runs.evaluate import Evaluation, named_aps
@@ -87,11 +83,11 @@ def run(
     if config.data.embeddings is not None:
         embeddings = open_embeddings(config.data.embeddings)
         digest = embeddings.source["weights_sha256"]
-    weights = starting_weights(
+    variables, pretrained, frozen_sha256 = starting_weights(
         config.model, init_from, config.data.image_backbone, digest
     )
-    if weights.variables is not None:
-        check_fits(model, weights.variables, str(init_from))
+    if variables is not None:
+        check_fits(model, variables, str(init_from))
     with claimed(folder, config):
         data = open_data(config, model)
         frames, grid = data.split("train"), data.records.grid
@@ -114,10 +110,12 @@ def run(
             loader,
             models.map_grid(grid, model, config.data.azimuth_mapping),
             folder,
-            info=checkpoint_info(config, grid, info, _invariants(frames, weights)),
+            info=checkpoint_info(
+                config, grid, info, _invariants(frames, frozen_sha256)
+            ),
             steps_per_epoch=len(frames) // config.train.batch_size,
-            variables=weights.variables,
-            pretrained=weights.pretrained,
+            variables=variables,
+            pretrained=pretrained,
             evaluate=validate,
             profile=str(profile),
         )
@@ -222,7 +220,7 @@ def checkpoint_info(
     return {**values, "run": dict(run), "same": dict(same)}
 
 
-def _invariants(frames: FrameSequence, weights: StartingWeights) -> dict[str, Any]:
+def _invariants(frames: FrameSequence, frozen_sha256: str | None) -> dict[str, Any]:
     """Returns properties of the data and frozen weights that a run must not change.
 
     Folders may move. Therefore frames are identified by their keys, and the frozen
@@ -233,8 +231,8 @@ def _invariants(frames: FrameSequence, weights: StartingWeights) -> dict[str, An
         "frames to train on": len(frames),
         "sha256 of their keys": hashlib.sha256(keys.encode()).hexdigest()[:16],
     }
-    if weights.frozen_sha256 is not None:
-        values[FROZEN_BACKBONE] = weights.frozen_sha256[:16]
+    if frozen_sha256 is not None:
+        values[FROZEN_BACKBONE] = frozen_sha256[:16]
     return values
 
 

@@ -15,8 +15,13 @@ from radejax import Detector, UserError, models
 from radejax.cli.figures import MODEL
 from radejax.core.config import base_config, load_module
 from radejax.core.errors import DataError
-from radejax.inference import exported_loader, saved
-from radejax.inference.saved import load_model, save_model, starting_weights
+from radejax.inference import exported_loader
+from radejax.inference.saved import (
+    WEIGHTS_FILE,
+    load_model,
+    save_model,
+    starting_weights,
+)
 from radejax.runs import experiment
 from radejax.training.checkpoints import Checkpoints
 from radejax.weights import radenet_torch
@@ -57,7 +62,7 @@ def test_a_torch_file_is_loaded_like_a_folder(tmp_path):
         load_model(path, step=3)
     with pytest.raises(UserError, match="the model is RADE-Net"):
         load_model(path, image_backbone=tmp_path)
-    weights = starting_weights(config, path).variables
+    weights, *_ = starting_weights(config, path)
     jax.tree.map(np.testing.assert_array_equal, weights, loaded.variables)
 
 
@@ -102,11 +107,9 @@ def test_classes_reordered_in_a_workdir_change_nothing_or_are_rejected(tmp_path)
 def test_weights_of_another_run_need_the_same_model(tmp_path):
     model = small.saved()
     save_model(model, tmp_path)
-    weights = starting_weights(model.config.model, init_from=tmp_path)
-    assert weights.pretrained is None
-    jax.tree.map(
-        np.testing.assert_array_equal, weights.variables, dict(model.variables)
-    )
+    variables, pretrained, _ = starting_weights(model.config.model, init_from=tmp_path)
+    assert pretrained is None
+    jax.tree.map(np.testing.assert_array_equal, variables, dict(model.variables))
     other = small.saved(model__heatmap_prior=0.25).config.model
     with pytest.raises(
         UserError, match=r"do not fit: config\.model\.heatmap_prior is .* 0\.25 here"
@@ -116,7 +119,7 @@ def test_weights_of_another_run_need_the_same_model(tmp_path):
 
 def test_without_anything_to_start_from_all_is_initialized():
     config = small.radar_config().model
-    assert starting_weights(config) == saved.StartingWeights()
+    assert starting_weights(config) == (None, None, None)
     with pytest.raises(UserError, match="RadeNet has no camera"):
         starting_weights(config, image_backbone_path="dinov3")
 
@@ -125,15 +128,14 @@ def test_a_frozen_backbone_is_known_by_its_weights(tmp_path):
     model = small.saved("camera")
     weights, config = model.variables["params"]["image_backbone"], model.config.model
     save_model(model, tmp_path / "all", with_backbone=True)
-    found = starting_weights(config, tmp_path / "all")
-    assert found.pretrained is None
-    assert found.frozen_sha256 == weights_sha256(weights)
+    _, pretrained, sha256 = starting_weights(config, tmp_path / "all")
+    assert pretrained is None
+    assert sha256 == weights_sha256(weights)
     # Embeddings of the same backbone stand for it.
-    embedded = starting_weights(config, embeddings_sha256=found.frozen_sha256)
-    assert embedded.frozen_sha256 == found.frozen_sha256
-    assert embedded.variables is embedded.pretrained is None
+    embedded = starting_weights(config, embeddings_sha256=sha256)
+    assert embedded == (None, None, sha256)
     tuned = small.saved("camera", model__image__freeze=False).config.model
-    assert starting_weights(tuned).frozen_sha256 is None
+    assert starting_weights(tuned)[2] is None
 
 
 # Exported folders --------------------------------------------------------------------
@@ -181,9 +183,7 @@ def test_weights_that_are_not_finite_are_an_error(tmp_path):
 def test_a_model_stored_in_half_is_half_and_computes_in_float32(tmp_path):
     for half in (False, True):
         save_model(small.saved(), tmp_path / str(half), half=half)
-    sizes = [
-        (tmp_path / n / saved.WEIGHTS_FILE).stat().st_size for n in ("False", "True")
-    ]
+    sizes = [(tmp_path / n / WEIGHTS_FILE).stat().st_size for n in ("False", "True")]
     assert sizes[1] < 0.6 * sizes[0]
 
     def same(ours, theirs):

@@ -13,7 +13,7 @@ from radejax.core.errors import UserError
 from radejax.data.kradar import dataset
 from radejax.detection.decode import DecodeOptions
 from radejax.inference.detect_files import detect_files
-from radejax.inference.saved import StartingWeights, load_model
+from radejax.inference.saved import load_model
 from radejax.runs import evaluate, experiment
 from radejax.runs.experiment import claimed
 from radejax.simulation.dataset import default_config, simulate_dataset
@@ -59,8 +59,7 @@ def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
 def test_frames_and_frozen_weights_tell_whether_a_run_is_the_same() -> None:
     def stays(keys: list[str], frozen: str | None = None) -> dict:
         frames = [SimpleNamespace(key=key) for key in keys]
-        weights = StartingWeights(frozen_sha256=frozen)
-        return experiment._invariants(frames, weights)
+        return experiment._invariants(frames, frozen)
 
     first = stays(["1/a", "1/b"])
     assert first == stays(["1/a", "1/b"])

@@ -219,7 +219,7 @@ def test_fine_tuning_starts_from_an_official_checkpoint(
     official = jax.jit(tiny.model.init)(jax.random.key(99), inputs)
     path = workdir / "best.safetensors"
     safetensors.numpy.save_file(radenet_torch.save(tiny.model, official), path)
-    variables = starting_weights(config.model, path).variables
+    variables, *_ = starting_weights(config.model, path)
     state, _ = loop.train(
         config,
         tiny.model,
