@@ -12,9 +12,6 @@ import radejax
 from radejax.cli import entry
 from radejax.core.errors import DataError, UserError
 
-_new_root = click.option(
-    "--out", required=True, type=entry.FOLDER, help="Root of the new dataset."
-)
 _rate = click.option(
     "--rate",
     type=entry.FRACTION,
@@ -34,7 +31,7 @@ def _echo_report(report: Any) -> None:
 @click.option(
     "--config", help="Config with a `simulation` section. Default: a small dataset."
 )
-@_new_root
+@entry.out_folder("Root of the new dataset.")
 @click.option("--seed", type=click.IntRange(0), help="Replaces the config's seed.")
 @click.option("--scenes", help='"procedural", or a label folder or zip of K-Radar.')
 @entry.sequences
@@ -122,7 +119,7 @@ def _shard(text: str) -> tuple[int, int]:
 
 @click.command(cls=entry.Command)
 @entry.roots
-@click.option("--out", required=True, type=entry.FOLDER, help="Folder of the records.")
+@entry.out_folder("Folder of the records.")
 @entry.labelled_frames
 @click.option(
     "--dtype",
@@ -164,7 +161,7 @@ def preprocess(
 
 @click.command(cls=entry.Command)
 @entry.roots
-@_new_root
+@entry.out_folder("Root of the new dataset.")
 @click.option(
     "--to",
     "release",
@@ -188,7 +185,7 @@ def reduce(roots: tuple[str, ...], out: pathlib.Path, **options: Any) -> None:
 
 @click.command(cls=entry.Command)
 @click.argument("paths", nargs=-1, required=True, type=entry.EXISTING)
-@click.option("--out", required=True, type=entry.FOLDER, help="Folder of the points.")
+@entry.out_folder("Folder of the points.")
 @click.option(
     "--to",
     "suffix",
@@ -235,18 +232,17 @@ def points(
     from radejax.inference.detect_files import find_frames, sequence_folder
 
     frames = find_frames(paths, sequence_numbers, weather)
-    folders = {path: sequence_folder(path) for path in frames}
     sources, skipped = dict[pathlib.Path, pathlib.Path](), dict[str, str]()
-    for path, folder in folders.items():
+    for path in frames:
         name = f"rpc_{path.stem.rpartition('_')[2]}.{suffix}"
-        target = out.absolute() / folder.name / name
+        target = out.absolute() / sequence_folder(path).name / name
         if target == path.absolute() or target in sources:
             raise UserError(
                 f"{sources.get(target, path)} and {path} would both be {target}; name "
                 "another --out, or roots of one form of radar data"
             )
         sources[target] = path
-    roots = {folder.parent for folder in folders.values()}
+    roots = {sequence_folder(path).parent for path in frames}
     grid = read_grid(sorted({*map(pathlib.Path, paths), *roots}))
     began = time.perf_counter()
     for target, path in tqdm.tqdm(sources.items(), "points", unit="frame"):
@@ -273,9 +269,7 @@ def points(
     type=entry.EXISTING,
     help="DINOv3 (folder or file), DINOv2 folder, or torchvision's ResNet-50 file.",
 )
-@click.option(
-    "--out", required=True, type=entry.FOLDER, help="Folder of the embeddings."
-)
+@entry.out_folder("Folder of the embeddings.")
 @entry.part
 @entry.camera_calibration
 @click.option(

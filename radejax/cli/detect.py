@@ -21,7 +21,7 @@ from radejax.cli import entry
     type=entry.EXISTING,
     help="Run of train.py, or any other SOURCE of `radejax export`.",
 )
-@click.option("--out", required=True, type=entry.FOLDER, help="Folder of the boxes.")
+@entry.out_folder("Folder of the boxes.")
 @entry.step
 @entry.part
 @entry.camera_calibration
@@ -80,7 +80,7 @@ def detect(
 
 @click.command(cls=entry.Command)
 @click.argument("source", type=entry.EXISTING)
-@click.option("--out", required=True, type=entry.FOLDER, help="Folder to write.")
+@entry.out_folder("Folder to write.")
 @click.option(
     "--format",
     "kind",

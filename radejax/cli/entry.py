@@ -265,6 +265,11 @@ def out_file(default: str, meaning: str) -> Callable[[Any], Any]:
     return click.option("--out", type=FILE, default=default, help=meaning)
 
 
+def out_folder(meaning: str) -> Callable[[Any], Any]:
+    """Returns the required option `--out` for the folder to write."""
+    return click.option("--out", required=True, type=FOLDER, help=meaning)
+
+
 def batch_size(default: int, meaning: str) -> Callable[[Any], Any]:
     """Returns the option `--batch-size`."""
     return click.option("--batch-size", type=COUNT, default=default, help=meaning)

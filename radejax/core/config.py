@@ -129,11 +129,21 @@ def config_file(name: str | os.PathLike[str]) -> pathlib.Path:
     if path.suffix == ".py" and path.is_file():
         return path
     names = sorted(file.stem for file in CONFIGS.glob("*.py"))
-    near = difflib.get_close_matches(path.stem, names, 1)
-    hint = f"; did you mean {near[0]}?" if near else ""
     raise UserError(
-        f"no such config file: {name}; give a .py file, or one of {', '.join(names)}{hint}"
+        f"no such config file: {name}; give a .py file, or one of {', '.join(names)}"
+        f"{did_you_mean(path.stem, names)}"
     )
+
+
+def did_you_mean(name: str, known: Collection[str], prefix: str = "") -> str:
+    """Returns a hint at the known name that is most similar to a wrong one, or "".
+
+    Examples:
+        >>> did_you_mean("radnet", ["radenet", "dinorade"])
+        '; did you mean radenet?'
+    """
+    near = difflib.get_close_matches(name, known, 1)
+    return f"; did you mean {prefix}{near[0]}?" if near else ""
 
 
 def load_config(path_and_options: str) -> ConfigDict:
@@ -420,8 +430,7 @@ def override(config: ConfigDict, texts: Mapping[str, str]) -> None:
     for name, text in texts.items():
         known = dict(fields_of(config))
         if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            hint = f"; did you mean config.{near[0]}?" if near else ""
+            hint = did_you_mean(name, known, "config.")
             raise UserError(f"config.{name} is not a field of this config{hint}")
         kind, value = known[name], _literal(text)
         if kind is tuple and not isinstance(value, tuple | list | None):

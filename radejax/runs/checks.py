@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 from typing import Any
 
 from ml_collections import ConfigDict
 from ml_collections.config_flags import config_path
 
 from radejax import models
-from radejax.core.config import fields_of, load_config
+from radejax.core.config import did_you_mean, fields_of, load_config
 from radejax.core.errors import (
     BELOW_ONE,
     POSITIVE,
@@ -179,10 +178,10 @@ def _check_fields(config: ConfigDict) -> None:
     found, known = dict(fields_of(config)), dict(fields_of(reference))
     for name in sorted(found.keys() ^ known.keys()):
         if not name.startswith(_OWN_NAMES):
-            near = difflib.get_close_matches(name, known, 1)
-            hint = f"; did you mean config.{near[0]}?" if name in found and near else ""
-            problem = "is not a field" if name in found else "is missing"
-            raise UserError(f"config.{name} {problem}{hint}")
+            if name not in found:
+                raise UserError(f"config.{name} is missing")
+            hint = did_you_mean(name, known, "config.")
+            raise UserError(f"config.{name} is not a field{hint}")
     for name, kind in known.items():
         try:
             value = config_path.get_value(name, config)
