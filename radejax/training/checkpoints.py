@@ -121,19 +121,18 @@ class Checkpoints:
         Raises:
             DiskFullError: No space is left on the disk; earlier checkpoints stay intact.
         """
-        description = {
+        description: dict[str, Any] = {
             "info": dict(info),
             "position": data_iterator.get_state(),
             "checksums": array_checksums(state),
         }
+        description["sha256"] = _text_checksum(description)
         with files.disk_full(self.folder):
             self._manager.save(
                 step,
                 args=ocp.args.Composite(
                     state=ocp.args.PyTreeSave(state),
-                    description=ocp.args.JsonSave(
-                        description | {"sha256": _text_checksum(description)}
-                    ),
+                    description=ocp.args.JsonSave(description),
                 ),
                 metrics=None if best is None else {_BEST: best},
             )
