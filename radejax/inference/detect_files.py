@@ -96,7 +96,6 @@ def front_images(
     paths: Sequence[pathlib.Path],
     detector: Detector,
     labels: PathLike | None = None,
-    version: str = "v2.1",
     camera_calibration: PathLike | None = None,
     roots: Sequence[PathLike] = (),
 ) -> dict[pathlib.Path, tuple[pathlib.Path, Camera]]:
@@ -104,10 +103,10 @@ def front_images(
 
     Args:
         paths: Radar files that `find_frames` returned.
-        detector: Detector of a radar-camera model.
+        detector: Detector of a radar-camera model. The version of the labels is that of
+            its config.
         labels: Label revision, see `KRadar`. If None, the label files of the sequences
             are used, and sequences without them have no images.
-        version: Version of the labels.
         camera_calibration: Folder of camera calibrations; None for those in the roots.
         roots: Files and folders in which `find_frames` searched. Folders of sequences
             without radar files may have their images and labels.
@@ -135,7 +134,7 @@ def front_images(
     frames = KRadar(
         sorted({folder.parent for folder in sequences}) + sorted(others),
         labels,
-        version=version,
+        version=detector.saved.config.data.label_version,
         visibility=None,
         field_of_view=False,
         sequence_numbers={int(folder.name) for folder in sequences},
@@ -219,10 +218,11 @@ def detect_files(
             f"format parquet needs {' and '.join(lacking)}: pip install {' '.join(lacking)}"
         )
     detector = Detector.from_workdir(source, step, image_backbone=image_backbone)
-    data, part = detector.saved.config.data, (sequence_numbers, weather)
+    data = detector.saved.config.data
     read = _files if data.format == "kradar" else _frames
+    part = {"sequence_numbers": sequence_numbers, "weather": weather}
     own = labels or data.labels, camera_calibration or data.camera_calibration
-    keys, radar, images = read(paths, *part, detector, *own)
+    keys, radar, images = read(paths, part, detector, *own)
 
     def inputs(batch: slice) -> Any:
         of_batch = radar(batch)
@@ -286,14 +286,13 @@ The latter are empty if no frame has any."""
 
 def _files(
     paths: Sequence[PathLike],
-    sequence_numbers: Sequence[int] | None,
-    weather: Sequence[str] | None,
+    part: Mapping[str, Any],
     detector: Detector,
     labels: PathLike | None,
     camera_calibration: PathLike | None,
 ) -> Inputs:
     """Find the frames in K-Radar's files."""
-    frames = find_frames(paths, sequence_numbers, weather)
+    frames = find_frames(paths, **part)
     seen: dict[str, pathlib.Path] = {}
     for path in frames:
         if (other := seen.setdefault(key_of(path), path)) is not path:
@@ -306,9 +305,7 @@ def _files(
     keys = [key_of(path) for path in frames]
     images: list[Any] = []
     if detector.takes_camera:
-        version = detector.saved.config.data.label_version
-        own = labels, version, camera_calibration, paths
-        known = front_images(frames, detector, *own)
+        known = front_images(frames, detector, labels, camera_calibration, paths)
         if known:
             images = [known.get(path.absolute(), (None, None)) for path in frames]
     return keys, frames.__getitem__, images
@@ -316,8 +313,7 @@ def _files(
 
 def _frames(
     roots: Sequence[PathLike],
-    sequence_numbers: Sequence[int] | None,
-    weather: Sequence[str] | None,
+    part: Mapping[str, Any],
     detector: Detector,
     labels: PathLike | None,
     camera_calibration: PathLike | None,
@@ -329,9 +325,8 @@ def _frames(
         labels,
         classes=config.classes,
         camera_calibration=camera_calibration,
-        sequence_numbers=sequence_numbers,
-        weather=weather,
-    ).part(sequence_numbers, weather)
+        **part,
+    ).part(*part.values())
     if not len(frames):
         named = ", ".join(map(str, roots))
         raise UserError(f"no frames in {named}: give the roots of the dataset")

@@ -12,6 +12,7 @@ import pytest
 
 from radejax import Detector, KRadar, models
 from radejax.cli import figures, main
+from radejax.core.config import base_config
 from radejax.core.errors import DataError, UserError
 from radejax.data.cameras import CameraOptions
 from radejax.data.records import Records
@@ -169,8 +170,11 @@ def test_images_on_another_disk_are_found(disks: Any) -> None:
     _, roots, labels = disks
     paths = find_frames(roots)
     assert len(paths) == 12
-    model = SimpleNamespace(image_size=(180, 320))
-    detector: Any = SimpleNamespace(model=model, camera_options=CameraOptions())
+    detector: Any = SimpleNamespace(
+        model=SimpleNamespace(image_size=(180, 320)),
+        camera_options=CameraOptions(),
+        saved=SimpleNamespace(config=base_config()),
+    )
     found = front_images(paths, detector, labels, roots=roots)
     assert set(found) == set(paths)
     for path, (image, camera) in found.items():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from radejax.core import files
+from radejax.core.config import base_config
 from radejax.core.errors import UserError
 from radejax.data.cameras import CameraOptions
 from radejax.evaluation.files import Source
@@ -170,8 +171,11 @@ def test_images_of_simulated_folders_are_found(tmp_path):
     config.update(train_sequences=1, test_sequences=0)
     root = simulate_dataset(config, tmp_path / "data", progress=False)
     (path,) = find_frames([root])
-    model = SimpleNamespace(image_size=(180, 320))
-    detector = SimpleNamespace(model=model, camera_options=CameraOptions())
+    detector = SimpleNamespace(
+        model=SimpleNamespace(image_size=(180, 320)),
+        camera_options=CameraOptions(),
+        saved=SimpleNamespace(config=base_config()),
+    )
     ((found, (image, camera)),) = front_images([path], detector).items()
     assert found == path.absolute()
     assert image.parent.name == "cam-front"
