@@ -10,7 +10,6 @@ from __future__ import annotations
 import ast
 import copy
 import difflib
-import importlib
 import importlib.util
 import json
 import os

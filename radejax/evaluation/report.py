@@ -99,10 +99,12 @@ def write_report(
     iou = options.iou_thresholds[0]
     settings = f"3d, IoU {iou:g}, score>{options.min_score:g}; precision and recall "
     settings += f"at score>{analysis.OPERATING_SCORE:g}"
+    # The split is that of all frames, or None if it is unknown or differs.
+    splits = np.unique(np.asarray(frames.get("split", [])).astype(str))
     metrics = {
         "run": run,
         "options": dataclasses.asdict(options),
-        "split": _split(frames),
+        "split": splits.item() if splits.size == 1 else None,
         "is_simulated": data.is_simulated,
         "num_frames": int(data.frame.size),
         "num_ground_truth": len(data.gt),
@@ -148,12 +150,6 @@ def write_report(
         if options.plots:
             _draw_curves(data, frames, options, folder)
     return Report(text, metrics, results, pathlib.Path(out_dir))
-
-
-def _split(frames: Columns) -> str | None:
-    """Returns the split of all frames, or None if it is unknown or differs."""
-    splits = np.unique(np.asarray(frames.get("split", [])).astype(str))
-    return str(splits[0]) if splits.size == 1 else None
 
 
 def _tables(

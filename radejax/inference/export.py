@@ -132,8 +132,7 @@ def export(
         half=half,
         programs=programs,
     )
-    kept = {*programs, "load.py"} if kind == "stablehlo" else {*programs}
-    for name in set(_OF_PROGRAMS) - kept:
+    for name in set(_OF_PROGRAMS) - set(programs):
         (folder / name).unlink(missing_ok=True)
     if kind == "stablehlo":
         files.write_text(folder / "load.py", inspect.getsource(exported_loader))

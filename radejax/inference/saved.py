@@ -204,7 +204,6 @@ def save_model(
         WEIGHTS_FILE: safetensors.numpy.save(arrays, {"format": "jax"}),
         **(programs or {}),
     }
-    folder.mkdir(parents=True, exist_ok=True)
     for name, data in contents.items():
         with files.atomic_write(folder / name) as file:
             file.write(data)

@@ -204,7 +204,6 @@ def save(model: ViT, params: Mapping[str, Any], folder: PathLike) -> None:
     """
     require(not model.position_grid, "position_grid", model.position_grid, "0, DINOv3")
     folder = files.as_path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     config = {theirs: getattr(model, ours) for theirs, ours in _FIELDS.items()}
     config |= _constants(model.gated_mlp)
     config |= {"architectures": ["DINOv3ViTModel"], "layerscale_value": 1.0}
