@@ -185,9 +185,8 @@ def score(
     path, given = pathlib.Path(predictions), _given(options)
     source, settings = _settings(path, given, bootstrap=200)
     # The names of the data would be long, so they are not part of the folder's.
-    usual: dict[str, Any] = {}
-    for part in _settings(path, {}, bootstrap=200):
-        usual |= vars(part)
+    usual_source, usual_settings = _settings(path, {}, bootstrap=200)
+    usual = vars(usual_source) | vars(usual_settings)
     names = usual.keys() - {"data", "labels", "ground_truth"}
     changes = {name: value for name, value in given.items() if name in names}
     end = f"_evaluation{name_of_changes(changes, usual)}"

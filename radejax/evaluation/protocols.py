@@ -55,8 +55,7 @@ class Protocol:
     def resolve_empty_frames(self, empty_frames: str) -> str:
         """Returns the empty-frame rule, which is the protocol's own for "protocol"."""
         expected = f"one of {', '.join(EMPTY_FRAMES)}"
-        is_known = empty_frames in EMPTY_FRAMES
-        require(is_known, "empty_frames", empty_frames, expected)
+        require(empty_frames in EMPTY_FRAMES, "empty_frames", empty_frames, expected)
         return self.empty_frames if empty_frames == "protocol" else empty_frames
 
 

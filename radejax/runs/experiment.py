@@ -81,8 +81,7 @@ def run(
     distributed.check_batch_size(config.train.batch_size)
     model, digest = models.build(config.model, config.data.num_frames), None
     if config.data.embeddings is not None:
-        embeddings = open_embeddings(config.data.embeddings)
-        digest = embeddings.source["weights_sha256"]
+        digest = open_embeddings(config.data.embeddings).source["weights_sha256"]
     variables, pretrained, frozen_sha256 = starting_weights(
         config.model, init_from, config.data.image_backbone, digest
     )
