@@ -161,14 +161,13 @@ class KradarMatches(NamedTuple):
     """Matches of K-Radar's two passes over all frames for any score threshold.
 
     Attributes:
-        first_gt: `[S]` ground truths matched in the first pass.
-        first_pred: `[S]` prediction matched to each of them.
+        first_pred: `[S]` predictions matched in the first pass, within a group in the order
+            of their ground truths.
         event_pred: `[E]` predictions at whose score the number of true positives of the
             second pass changes as the score threshold decreases.
         event_delta: `[E]` change of the number of true positives at each of them.
     """
 
-    first_gt: Int[np.ndarray, " S"]
     first_pred: Int[np.ndarray, " S"]
     event_pred: Int[np.ndarray, " E"]
     event_delta: Int[np.ndarray, " E"]
@@ -203,7 +202,6 @@ def match_kradar(
     pairs = pairs.take(pairs.iou > threshold)
     preference = score[pairs.pred]
     chosen = greedy(pairs.gt, pairs.pred, preference, gt_group[pairs.gt], score.size)
-    first = pairs.take(chosen)
     # A ground truth that shares none of its predictions with another one is a true
     # positive for all thresholds up to its best score.
     has_rival = np.zeros(gt_group.size, bool)
@@ -214,8 +212,7 @@ def match_kradar(
     rivals = pairs.take(has_rival[pairs.gt])
     step_pred, step_delta = _steps(rivals, score, gt_group[rivals.gt])
     return KradarMatches(
-        first.gt,
-        first.pred,
+        pairs.pred[chosen],
         np.concatenate([best, step_pred]),
         np.concatenate([np.ones(best.size, np.int64), step_delta]),
     )
