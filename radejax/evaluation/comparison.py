@@ -144,7 +144,7 @@ def compare(
         # The first row counts every frame once, which gives the APs over all frames.
         weights = np.ones((1, of_frame.size), np.int16)
         if kind == "all" or np.unique(of_frame).size > 1:
-            drawn = sequence_weights(of_frame, resamples=options.bootstrap, seed=0)
+            drawn = sequence_weights(of_frame, resamples=options.bootstrap)
             weights = np.concatenate([weights, drawn])
         for protocol, space in itertools.product(names, spaces):
             metric, terms = (protocol, space, iou), options.settings_of(protocol)

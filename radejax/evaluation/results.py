@@ -134,10 +134,8 @@ class EvaluationOptions:
     @property
     def main_protocols(self) -> tuple[str, ...]:
         """Protocols shown in full on the console and with intervals per weather."""
-        usual = dict.fromkeys(
-            (protocols.RECOMMENDED, "kradar_r40", self.paper_protocol)
-        )
-        return tuple(name for name in usual if name in self.protocols)
+        shown = protocols.RECOMMENDED, "kradar_r40", self.paper_protocol
+        return tuple(name for name in dict.fromkeys(shown) if name in self.protocols)
 
     def settings_of(self, protocol: str) -> dict[str, Any]:
         """Returns the score threshold and empty-frame rule of a protocol for `results`."""
@@ -234,9 +232,7 @@ def compute_results(
         if sequence is not None and np.unique(sequence[mask]).size > 1:
             part = data if mask.all() else data.of_frames(mask)
             is_single = in_one_sequence(part, sequence[mask])
-            weights = sequence_weights(
-                sequence[mask], resamples=options.bootstrap, seed=0
-            )
+            weights = sequence_weights(sequence[mask], resamples=options.bootstrap)
         for protocol in options.protocols:
             settings = options.settings_of(protocol)
             results = data.results(
@@ -277,7 +273,7 @@ def _mean(group: Sequence[Result]) -> Result:
 
 
 def sequence_weights(
-    sequence: Shaped[np.ndarray, " F"], *, resamples: int, seed: int
+    sequence: Shaped[np.ndarray, " F"], *, resamples: int, seed: int = 0
 ) -> Int[np.ndarray, "B F"]:
     """Draws how often each frame counts in each resample, as int16.
 

@@ -55,12 +55,9 @@ def make_schedule(train: ConfigDict, steps_per_epoch: int) -> optax.Schedule:
     """
     peak, minimum = train.learning_rate, train.final_learning_rate
     num_steps, warmup_steps = count_steps(train, steps_per_epoch), train.warmup_steps
-    require(
-        warmup_steps < num_steps,
-        "config.train.warmup_steps",
-        warmup_steps,
-        f"less than the {num_steps} steps of the training",
-    )
+    expected = f"less than the {num_steps} steps of the training"
+    is_shorter = warmup_steps < num_steps
+    require(is_shorter, "config.train.warmup_steps", warmup_steps, expected)
     if train.schedule == "cosine":
         return optax.warmup_cosine_decay_schedule(
             0.0, peak, warmup_steps, num_steps, minimum
