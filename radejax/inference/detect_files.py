@@ -326,7 +326,7 @@ def _frames(
         classes=config.classes,
         camera_calibration=camera_calibration,
         **part,
-    ).part(*part.values())
+    ).part(part["sequence_numbers"], part["weather"])
     if not len(frames):
         named = ", ".join(map(str, roots))
         raise UserError(f"no frames in {named}: give the roots of the dataset")
