@@ -38,10 +38,10 @@ from radejax.cli import entry
 @click.option(
     "--format",
     "file_format",
-    type=click.Choice(["json", "kitti", "csv", "parquet"]),
+    type=click.Choice(["json", "kitti", "csv"]),
     default="json",
     help="json: one file per frame. kitti: preds/000000.txt as K-Radar's tools write them. "
-    "csv, parquet: a single table (parquet needs pandas and pyarrow).",
+    "csv: a single table.",
 )
 @entry.batch_size(8, "Frames per call of the detector.")
 @entry.image_backbone

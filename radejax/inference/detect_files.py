@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import importlib.util
 import itertools
 import json
 import pathlib
@@ -190,8 +189,8 @@ def detect_files(
         batch_size: Number of frames per call of the detector.
         file_format: "json", or "kitti" for files `preds/000000.txt` in the format of
             K-Radar's tools, and `frames.json` with the frames that these numbers stand for.
-            "csv" and "parquet" write one table `boxes.csv` or `boxes.parquet` of all boxes
-            at the end, in the columns of the records.
+            "csv" writes one table `boxes.csv` of all boxes at the end, in the columns of
+            the records.
         sequence_numbers: Numbers of the sequences to take, see `find_frames`.
         weather: Kinds of weather to take, see `find_frames`.
         labels: Label revision in which a radar-camera model's images are looked up; the
@@ -212,11 +211,6 @@ def detect_files(
             radar-camera model has images without any calibration, or an image or weight is
             not as expected.
     """
-    needed = ("pandas", "pyarrow") if file_format == "parquet" else ()
-    if lacking := [name for name in needed if importlib.util.find_spec(name) is None]:
-        raise UserError(
-            f"format parquet needs {' and '.join(lacking)}: pip install {' '.join(lacking)}"
-        )
     detector = Detector.from_workdir(source, step, image_backbone=image_backbone)
     data = detector.saved.config.data
     read = _files if data.format == "kradar" else _frames
@@ -236,13 +230,13 @@ def detect_files(
         table = {"frame": list(range(len(keys))), "name": keys}
         files.write_json(out / "frames.json", table)
     batches = _batches(keys, detector.num_frames, batch_size)
-    is_table, rows = file_format in ("csv", "parquet"), list[dict[str, Any]]()
+    rows: list[dict[str, Any]] = []
     streams = (detector.stream(map(inputs, part), **settings) for part in batches)
     found = itertools.chain.from_iterable(streams)
     count = {"frames": len(keys), "boxes": 0, "clipped": 0}
     with tqdm.tqdm(total=len(keys), desc="detect", unit="frame") as bar:
         for batch, detections in zip(itertools.chain(*batches), found, strict=True):
-            if is_table:
+            if file_format == "csv":
                 rows += itertools.chain(*_records(keys[batch], detections))
             else:
                 texts = _texts(keys[batch], detections, file_format)
@@ -251,8 +245,13 @@ def detect_files(
             count["boxes"] += int(np.asarray(detections.is_valid).sum())
             count["clipped"] += int(detections.num_clipped.sum())
             bar.update(len(keys[batch]))
-    if is_table:
-        _write_table(out / f"boxes.{file_format}", rows)
+    if file_format == "csv":
+        columns = ("frame", "cls", "score", *BOX_FIELDS)
+        path = out / "boxes.csv"
+        with files.atomic_path(path) as temporary, open(temporary, "w") as file:
+            writer = csv.DictWriter(file, columns, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
     if detector.num_frames > 1:
         count["repeated"] = len(batches)
     if detector.takes_camera:
@@ -357,21 +356,6 @@ def _records(keys: Sequence[str], detections: Detections) -> list[list[dict[str,
     """Return the boxes of every frame of a batch, with the key of the frame."""
     frames = zip(keys, detections.to_list(), strict=True)
     return [[{"frame": key, **box} for box in boxes] for key, boxes in frames]
-
-
-def _write_table(path: pathlib.Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write boxes as CSV or Parquet, atomically."""
-    columns = ("frame", "cls", "score", *BOX_FIELDS)
-    if path.suffix == ".csv":
-        with files.atomic_path(path) as temporary, open(temporary, "w") as file:
-            table = csv.DictWriter(file, columns, lineterminator="\n")
-            table.writeheader()
-            table.writerows(rows)
-        return
-    import pandas as pd  # an optional dependency
-
-    with files.atomic_path(path) as temporary:
-        pd.DataFrame(rows, columns=list(columns)).to_parquet(temporary)
 
 
 def key_of(path: pathlib.Path) -> str:

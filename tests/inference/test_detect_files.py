@@ -1,7 +1,6 @@
 """Frames in folders, their images, models of every kind, names of results."""
 
 import csv
-import importlib.util
 import json
 from types import SimpleNamespace
 
@@ -103,9 +102,6 @@ def test_boxes_of_an_exported_folder(tmp_path):
         f"7/{i:05}" for i, boxes in enumerate(expected) for _ in boxes
     ]
     assert float(rows[0]["yaw"]) == pytest.approx(expected[0][0]["yaw"], abs=1e-5)
-    if not importlib.util.find_spec("pyarrow"):
-        with pytest.raises(UserError, match=r"parquet needs .*pyarrow: pip install"):
-            detect_files(model, data, tmp_path / "t", file_format="parquet")
     # Either is scored against labels whose frames have the key of both sensors.
     table = {
         "frame": [4, 5],
