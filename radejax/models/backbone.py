@@ -24,17 +24,12 @@ REDUCTION = 16
 """Channels per hidden unit of the channel attention's network."""
 
 
-class ChannelAttention(nn.Module):
+class ChannelAttention(layers.Layer):
     """Scales channels by factors computed from their global maximum and global mean.
 
     The same two-layer network is applied to the maximum and to the mean. The factors are
     the sigmoid of the sum of both outputs.
-
-    Attributes:
-        dtype: Dtype of the computation and the output.
     """
-
-    dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(self, x: Map) -> Map:
@@ -48,7 +43,7 @@ class ChannelAttention(nn.Module):
         return x * weight[:, None, None]
 
 
-class SpatialAttention(nn.Module):
+class SpatialAttention(layers.Layer):
     """Computes the spatial attention weight of every bin, in (0, 1).
 
     The weight is the sigmoid of a 7x7 convolution over two maps, the maximum and the mean
@@ -57,11 +52,9 @@ class SpatialAttention(nn.Module):
     Attributes:
         mean_first: Whether to concatenate [mean, max], as in the paper, instead of
             [max, mean], as in the released code.
-        dtype: Dtype of the computation and the output.
     """
 
     mean_first: bool = False
-    dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(self, x: Map) -> Float[jax.Array, "B R A 1"]:
@@ -71,7 +64,7 @@ class SpatialAttention(nn.Module):
         return nn.sigmoid(conv(jnp.stack(pooled, -1)))
 
 
-class CBAM(nn.Module):
+class CBAM(layers.Layer):
     """Channel attention followed by spatial attention, in a skip connection.
 
     Attributes:
@@ -79,12 +72,10 @@ class CBAM(nn.Module):
             code, has a `ConvGNSiLU` before them, adds the output of this convolution to
             theirs, and ends with another `ConvGNSiLU`.
         num_groups: Groups of the normalizations of the official block.
-        dtype: Dtype of the computation and the output.
     """
 
     kind: CBAMKind
     num_groups: int
-    dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(self, x: Map) -> Map:
@@ -101,7 +92,7 @@ class CBAM(nn.Module):
         return y
 
 
-class InputStem(nn.Module):
+class InputStem(layers.Layer):
     """Encodes Doppler and elevation channels separately before mixing them.
 
     A 1x1 convolution encodes Doppler to `features` channels and another encodes elevation
@@ -112,13 +103,11 @@ class InputStem(nn.Module):
         features: Output channels.
         doppler_bins: Number of Doppler channels, which precede the elevation channels.
         num_groups: Groups of the normalizations.
-        dtype: Dtype of the computation and the output.
     """
 
     features: int
     doppler_bins: int
     num_groups: int
-    dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(self, x: Features) -> Features:
@@ -135,7 +124,7 @@ class InputStem(nn.Module):
         return block(self.features, name="mix")(jnp.concatenate(encoded, -1))
 
 
-class Backbone(nn.Module):
+class Backbone(layers.Part):
     """U-Net, projection `[B, R, A, D+E]` -> features `[B, R, A, decoder_width]`.
 
     Encoder level i has `widths[i]` channels and then halves the resolution. Each decoder
@@ -146,21 +135,15 @@ class Backbone(nn.Module):
         doppler_bins: Number of Doppler channels of the input, used by `InputStem` only.
         widths: Channels of the encoder levels, finest first.
         decoder_width: Channels of the last decoder stage.
-        num_groups: Groups of the normalizations.
         cbam: Kind of the `CBAM` in the skip connections; None for skips without attention.
         input_stem: Whether to use `InputStem` instead of one 3x3 convolution.
-        dtype: Dtype of the computation and the output.
-        remat: Recompute blocks in the backward pass instead of storing them.
     """
 
     doppler_bins: int
     widths: tuple[int, ...] = (128, 256, 512)
     decoder_width: int = 128
-    num_groups: int = 32
     cbam: CBAMKind | None = "official"
     input_stem: bool = False
-    dtype: Any = jnp.float32
-    remat: bool = False
 
     @nn.compact
     def __call__(self, x: Features) -> Features:

@@ -28,6 +28,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from radejax.models.layers import Layer
+
 Arrays = tuple[jax.Array, ...]
 Places = Float[jax.Array, "*places"]
 
@@ -39,7 +41,7 @@ large chunks.
 """
 
 
-class Linear(nn.Module):
+class Linear(Layer):
     """Linear layer that returns its product `[..., C']` and its bias `[C']` separately.
 
     Attributes:
@@ -53,7 +55,6 @@ class Linear(nn.Module):
     features: int
     kernel_init: Any = nn.initializers.xavier_uniform()
     bias_init: Any = nn.initializers.zeros
-    dtype: Any = jnp.float32
     precision: str | None = None
 
     @nn.compact
@@ -66,7 +67,7 @@ class Linear(nn.Module):
         return jnp.matmul(x, kernel, precision=self.precision), bias
 
 
-class DeformableAttention(nn.Module):
+class DeformableAttention(Layer):
     """Multi-head deformable cross-attention, including its four linear layers.
 
     Attributes:
@@ -81,7 +82,6 @@ class DeformableAttention(nn.Module):
     num_heads: int = 4
     num_points: int = 4
     chunk_size: int = 0
-    dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(

@@ -88,7 +88,7 @@ class DinoRade(RadeNet, kw_only=True):
         else:
             remat = shared["remat"] and not self.freeze
             self.image_backbone = self.vit.clone(dtype=dtype, remat=remat, parent=None)
-            self.image_neck = CameraNeck(width, dtype)
+            self.image_neck = CameraNeck(width, dtype=dtype)
         self.image_fusion = self.fusion.clone(**shared, parent=None)
 
     @nn.compact

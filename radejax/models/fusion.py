@@ -19,13 +19,13 @@ from radejax.core.structures import Array
 from radejax.models import lifting
 from radejax.models.deformable_attention import DeformableAttention
 from radejax.models.heads import DilatedNeck
-from radejax.models.layers import Dense, Map
+from radejax.models.layers import Dense, Map, Part
 from radejax.models.lifting import OutOfViewRule, ReferencePoints, WeightingKind
 
 GateKind = Literal["channel", "bin"]
 
 
-class Fusion(nn.Module):
+class Fusion(Part):
     """Weighted lifting, deformable attention to the camera map, and gated sum with the radar.
 
     Attributes:
@@ -47,7 +47,6 @@ class Fusion(nn.Module):
         dropout: Dropout rate of the fused map.
         num_groups: Groups of the necks' normalizations.
         chunk_size: Bins per chunk of the attention; 0 selects a default for the platform.
-        dtype: Dtype of the computation and the output.
         remat: Recompute the necks in the backward pass instead of storing their blocks.
     """
 
@@ -59,10 +58,7 @@ class Fusion(nn.Module):
     out_of_view: OutOfViewRule = "drop"
     necks: bool = True
     dropout: float = 0.1
-    num_groups: int = 32
     chunk_size: int = 0
-    dtype: Any = jnp.float32
-    remat: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -111,7 +107,7 @@ class Fusion(nn.Module):
         if self.necks:
             camera = self._neck("camera_neck")(camera)
         weights = lifting.WeightingNetwork(
-            self.num_elevation, self.weighting, self.dtype, name="weighting"
+            self.num_elevation, self.weighting, dtype=self.dtype, name="weighting"
         )(elevation)  # [B, R, A, E]
         scale = weights * reference.is_valid
         mean = lifting.query_weights(jnp.asarray(reference.is_valid), self.out_of_view)
@@ -120,7 +116,7 @@ class Fusion(nn.Module):
             return jnp.asarray(x).reshape(x.shape[0], r * a, *x.shape[3:])
 
         counts = self.num_heads, self.num_points, self.chunk_size
-        attention = DeformableAttention(c, *counts, self.dtype, name="attention")
+        attention = DeformableAttention(c, *counts, dtype=self.dtype, name="attention")
         points, means = per_bin(reference.points), per_bin(mean)
         seen = attention(per_bin(radar), per_bin(scale), points, means, camera)
         seen = seen.reshape(b, r, a, c)
@@ -130,7 +126,8 @@ class Fusion(nn.Module):
         return dropout(share * seen + (1 - share) * radar)
 
     def _neck(self, name: str) -> DilatedNeck:
-        return DilatedNeck(self.num_groups, self.dtype, self.remat, name=name)
+        shared: dict[str, Any] = {"num_groups": self.num_groups, "dtype": self.dtype}
+        return DilatedNeck(**shared, remat=self.remat, name=name)
 
     def _camera_share(self, radar: Map, seen: Map) -> Float[jax.Array, "B R A #C"]:
         """Returns the weight of the camera per bin, for every channel or for all together."""

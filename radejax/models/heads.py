@@ -14,51 +14,38 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import flax.linen as nn
-import jax.numpy as jnp
 
 from radejax.core.config import find_part
 from radejax.core.structures import DetectionMaps
-from radejax.models.layers import Conv, ConvGNSiLU, Features, GroupNorm, Map
+from radejax.models import layers
+from radejax.models.layers import ConvGNSiLU, Features, Map
 
 
-class DilatedResidual(nn.Module):
+class DilatedResidual(layers.Layer):
     """Dilated `ConvGNSiLU`, convolution and normalization, with a residual, then SiLU.
 
     Attributes:
         dilation: Dilation of the first convolution in bins.
         num_groups: Groups of the normalizations.
-        dtype: Dtype of the computation and the output.
     """
 
     dilation: int
     num_groups: int
-    dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(self, x: Map) -> Map:
         features = x.shape[-1]
         block = functools.partial(ConvGNSiLU, dilation=self.dilation, dtype=self.dtype)
         y = block(features, self.num_groups, name="conv_1")(x)
-        y = Conv(features, dtype=self.dtype, name="conv_2")(y)
-        y = GroupNorm(self.num_groups, dtype=self.dtype, name="norm")(y)
+        y = layers.Conv(features, dtype=self.dtype, name="conv_2")(y)
+        y = layers.GroupNorm(self.num_groups, dtype=self.dtype, name="norm")(y)
         return nn.silu(x + y)
 
 
-class Neck(nn.Module):
-    """Base class of the necks, which keep the shape of a map.
-
-    Attributes:
-        num_groups: Groups of the normalizations.
-        dtype: Dtype of the computation and the output.
-        remat: Recompute blocks in the backward pass instead of storing them.
-    """
-
-    num_groups: int = 32
-    dtype: Any = jnp.float32
-    remat: bool = False
+class Neck(layers.Part):
+    """Base class of the necks, which keep the shape of a map."""
 
 
 class DilatedNeck(Neck):
@@ -90,21 +77,16 @@ NECKS: dict[str, type[Neck]] = {"dilated": DilatedNeck, "plain": PlainNeck}
 NUM_BOX_PARAMS = 8
 
 
-class Head(nn.Module):
+class Head(layers.Part):
     """Base class of the heads, `[B, R, A, C]` -> `[B, R, A, features]` in float32.
 
     Attributes:
         features: Output channels.
-        num_groups: Groups of the normalizations.
         dtype: Dtype of the computation up to the last convolution.
-        remat: Recompute blocks in the backward pass instead of storing them.
         initial_bias: Constant added to the initial biases of the last convolution.
     """
 
     features: int
-    num_groups: int = 32
-    dtype: Any = jnp.float32
-    remat: bool = False
     initial_bias: float = 0.0
 
     def convolve(self, x: Features, widths: Sequence[int]) -> Features:
@@ -112,7 +94,7 @@ class Head(nn.Module):
         block = nn.remat(ConvGNSiLU) if self.remat else ConvGNSiLU
         for i, width in enumerate(widths, 1):
             x = block(width, self.num_groups, dtype=self.dtype, name=f"conv_{i}")(x)
-        out = Conv(self.features, 1, initial_bias=self.initial_bias, name="out")
+        out = layers.Conv(self.features, 1, initial_bias=self.initial_bias, name="out")
         return out(x)
 
 
@@ -136,24 +118,19 @@ HEADS: dict[str, type[Head]] = {"expanded": ExpandedHead, "default": DefaultHead
 """Heads by their name in `config.model.heads`."""
 
 
-class Heads(nn.Module):
+class Heads(layers.Part):
     """Heatmap head and box head, features `[B, R, A, C]` -> `DetectionMaps` in float32.
 
     Attributes:
         num_classes: Channels of the heatmap.
         kind: Name of the heads' type in `HEADS`, or "module:Class".
-        num_groups: Groups of the normalizations.
         dtype: Dtype of the computation up to the last convolution.
-        remat: Recompute blocks in the backward pass instead of storing them.
         heatmap_prior: Approximate score of every bin in an untrained model, 0.5 in the
             released code. A lower value (0.1 in CenterNet) suits mostly empty scenes.
     """
 
     num_classes: int
     kind: str = "expanded"
-    num_groups: int = 32
-    dtype: Any = jnp.float32
-    remat: bool = False
     heatmap_prior: float = 0.5
 
     @nn.compact

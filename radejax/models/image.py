@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Real
 
 from radejax.models.convolution import product
-from radejax.models.layers import Conv, Dense, uniform_fan_in
+from radejax.models.layers import Conv, Dense, Layer, uniform_fan_in
 
 Tokens = Float[jax.Array, "B h w C"]
 HasImage = Bool[jax.Array, " B"]
@@ -58,7 +58,7 @@ def normalize(
 _PHASE_TAPS = np.array([[3, 1], [2, 0]])
 
 
-class TransposedConv(nn.Module):
+class TransposedConv(Layer):
     """Transposed 4x4 convolution, stride 2, padding 1: `[B,H,W,C]` -> `[B,2H,2W,C']`.
 
     Every output depends on 2x2 inputs through one of four kernels, selected by the parity
@@ -73,7 +73,6 @@ class TransposedConv(nn.Module):
     """
 
     features: int
-    dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(
@@ -102,7 +101,7 @@ class TransposedConv(nn.Module):
         return y + jnp.expand_dims(bias, (0, 1, 2))
 
 
-class CameraNeck(nn.Module):
+class CameraNeck(Layer):
     """Image tokens `[B, h, w, C]` -> camera map `[B, 4h, 4w, features]`.
 
     The layers are a linear layer, two transposed convolutions that each double the
@@ -115,7 +114,6 @@ class CameraNeck(nn.Module):
     """
 
     features: int = 128
-    dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(
@@ -168,7 +166,7 @@ STRIDE = 16
 """Image pixels per pixel of the trunk's output, along each axis."""
 
 
-class FrozenBatchNorm(nn.Module):
+class FrozenBatchNorm(Layer):
     """Batch normalization with fixed statistics, which are stored as parameters.
 
     A frozen backbone thus has only parameters, and no forward pass updates any of them.
@@ -176,8 +174,6 @@ class FrozenBatchNorm(nn.Module):
     Attributes:
         dtype: Dtype of the output.
     """
-
-    dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(self, x: Float[jax.Array, "B H W C"]) -> Float[jax.Array, "B H W C"]:
@@ -198,11 +194,11 @@ def _normalized(
     x: jax.Array, name: str, frozen: bool, dtype: Any, train: bool, mask: Mask = None
 ) -> jax.Array:
     if frozen:
-        return FrozenBatchNorm(dtype, name=name)(x)
+        return FrozenBatchNorm(dtype=dtype, name=name)(x)
     return batch_norm(name, dtype, train)(x, mask=mask)
 
 
-class Bottleneck(nn.Module):
+class Bottleneck(Layer):
     """Residual block of 1x1, 3x3 and 1x1 convolutions; the 3x3 convolution has the stride.
 
     Attributes:
@@ -217,7 +213,6 @@ class Bottleneck(nn.Module):
     stride: int
     is_first: bool
     frozen: bool
-    dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(
@@ -245,7 +240,7 @@ def _stage(
         )
 
 
-class ResNetTrunk(nn.Module):
+class ResNetTrunk(Layer):
     """Stem and first three stages of a ResNet, with a stride of 16 in total.
 
     Attributes:
@@ -259,7 +254,6 @@ class ResNetTrunk(nn.Module):
     width: int = 64
     depths: tuple[int, int, int] = (3, 4, 6)
     frozen: bool = True
-    dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(
@@ -281,7 +275,7 @@ class ResNetTrunk(nn.Module):
         return x.astype(jnp.float32)
 
 
-class ResNetNeck(nn.Module):
+class ResNetNeck(Layer):
     """Last stage of a ResNet, with stride 2, and a 1x1 convolution.
 
     Attributes:
@@ -294,7 +288,6 @@ class ResNetNeck(nn.Module):
     features: int = 128
     width: int = 64
     depth: int = 3
-    dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(

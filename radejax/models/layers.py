@@ -49,7 +49,29 @@ def _cut(numbers: jax.Array, shape: tuple[int, ...]) -> jax.Array:
     return numbers[: math.prod(shape)].reshape(shape)
 
 
-class Conv(nn.Module):
+class Layer(nn.Module, kw_only=True):
+    """Base class of the layers.
+
+    Attributes:
+        dtype: Dtype of the computation and the output.
+    """
+
+    dtype: Any = jnp.float32
+
+
+class Part(Layer, kw_only=True):
+    """Base class of the parts of a detector, to which it passes these fields.
+
+    Attributes:
+        num_groups: Groups of the normalizations.
+        remat: Recompute blocks in the backward pass instead of storing them.
+    """
+
+    num_groups: int = 32
+    remat: bool = False
+
+
+class Conv(Layer):
     """Convolution padded by half the kernel's size, `[B, R, A, C]` -> `[B, r, a, C']`.
 
     Attributes:
@@ -59,7 +81,6 @@ class Conv(nn.Module):
         stride: Stride per axis; a stride above 1 requires a dilation of 1.
         use_bias: Whether to add a bias per output channel.
         initial_bias: Constant added to the initial biases, which torch draws around 0.
-        dtype: Dtype of the computation and the output.
     """
 
     features: int
@@ -68,7 +89,6 @@ class Conv(nn.Module):
     stride: int = 1
     use_bias: bool = True
     initial_bias: float = 0.0
-    dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(self, x: Features) -> Float[jax.Array, "B r a {self.features}"]:
@@ -90,16 +110,14 @@ class Conv(nn.Module):
         return y
 
 
-class Dense(nn.Module):
+class Dense(Layer):
     """Linear layer on the last axis with torch's initializer.
 
     Attributes:
         features: Output channels.
-        dtype: Dtype of the computation and the output.
     """
 
     features: int
-    dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(
@@ -112,7 +130,7 @@ class Dense(nn.Module):
         return y + jnp.expand_dims(bias, range(y.ndim - 1))
 
 
-class Upsample(nn.Module):
+class Upsample(Layer):
     """Transposed 2x2 convolution with stride 2, `[B, R, A, C]` -> `[B, 2R, 2A, C']`.
 
     The outputs of neighboring inputs do not overlap, so the layer is computed as one matrix
@@ -121,11 +139,9 @@ class Upsample(nn.Module):
 
     Attributes:
         features: Output channels C'.
-        dtype: Dtype of the computation and the output.
     """
 
     features: int
-    dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(self, x: Features) -> Float[jax.Array, "B 2*R 2*A {self.features}"]:
@@ -147,7 +163,7 @@ def max_pool(x: Map) -> Float[jax.Array, "B R//2 A//2 C"]:
     return x.reshape(b, r // 2, 2, a // 2, 2, c).max((2, 4))
 
 
-class GroupNorm(nn.Module):
+class GroupNorm(Layer):
     """Group normalization over bins and the channels of a group, with scale and bias.
 
     Sums are computed per channel and then combined into groups, so that the map is read
@@ -159,7 +175,6 @@ class GroupNorm(nn.Module):
     """
 
     num_groups: int
-    dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(self, x: Map) -> Map:
@@ -183,7 +198,7 @@ class GroupNorm(nn.Module):
         return y.astype(self.dtype)
 
 
-class ConvGNSiLU(nn.Module):
+class ConvGNSiLU(Layer):
     """Convolution, group normalization and SiLU, `[B, R, A, C]` -> `[B, R, A, C']`.
 
     Attributes:
@@ -192,7 +207,6 @@ class ConvGNSiLU(nn.Module):
         size: Odd kernel size per axis.
         dilation: Dilation of the kernel in bins.
         use_bias: Whether the convolution has a bias.
-        dtype: Dtype of the computation and the output.
     """
 
     features: int
@@ -200,7 +214,6 @@ class ConvGNSiLU(nn.Module):
     size: int = 3
     dilation: int = 1
     use_bias: bool = True
-    dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(self, x: Features) -> Features:
@@ -210,7 +223,7 @@ class ConvGNSiLU(nn.Module):
         return nn.silu(x)
 
 
-class DoubleConvResidual(nn.Module):
+class DoubleConvResidual(Layer):
     """Two `ConvGNSiLU` with a residual connection, which is added after the activation.
 
     If the numbers of channels differ, the shortcut has a 1x1 convolution.
@@ -218,12 +231,10 @@ class DoubleConvResidual(nn.Module):
     Attributes:
         features: Output channels.
         num_groups: Groups of the normalizations.
-        dtype: Dtype of the computation and the output.
     """
 
     features: int
     num_groups: int
-    dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(self, x: Features) -> Features:

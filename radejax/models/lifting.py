@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float
 from radejax.core.errors import require
 from radejax.geometry.camera import Camera, project
 from radejax.geometry.radar_grid import RadarGrid, is_uniform, values_at
-from radejax.models.layers import Conv, Dense, GroupNorm
+from radejax.models.layers import Conv, Dense, GroupNorm, Layer
 
 OutOfViewRule = Literal["drop", "official"]
 WeightingKind = Literal["mlp", "cnn", "off"]
@@ -207,7 +207,7 @@ def query_weights(
     return weights / jnp.maximum(weights.sum(-1, keepdims=True), 1.0)
 
 
-class WeightingNetwork(nn.Module):
+class WeightingNetwork(Layer):
     """Elevation channels `[B, R, A, D]` -> weights `[B, R, A, E]`, a softmax over segments.
 
     Attributes:
@@ -221,7 +221,6 @@ class WeightingNetwork(nn.Module):
 
     num_elevation: int = 10
     kind: WeightingKind = "mlp"
-    dtype: Any = jnp.float32
 
     @nn.compact
     def __call__(

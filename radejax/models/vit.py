@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Float
 
 from radejax.core.errors import SIZE, check_options, integer, one_of, require
+from radejax.models.layers import Layer
 
 AttentionKind = Literal["auto", "blocked", "xla", "cudnn"]
 
@@ -34,7 +35,7 @@ _BLOCK = 256  # queries per block, so that the scores of a head stay in the cach
 _INIT = nn.initializers.truncated_normal(0.02)
 
 
-class ViT(nn.Module):
+class ViT(Layer):
     """Vision transformer, images `[B, H, W, 3]` -> tokens `[B, 1 + registers + patches, C]`.
 
     The tokens are the class token, the registers and the patches in row-major order, after
@@ -71,7 +72,6 @@ class ViT(nn.Module):
     layer_scale: float = 1.0
     position_grid: int = 0
     attention: AttentionKind = "auto"
-    dtype: Any = jnp.float32
     remat: bool = False
 
     def __post_init__(self) -> None:

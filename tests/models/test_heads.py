@@ -25,7 +25,7 @@ def test_dilated_residual_equals_official(dilation, module_case, run_like_torch)
 def reach(kind):
     """Bins around the center that a change of the center reaches through the convs."""
     x = jax.random.normal(jax.random.key(1), (1, 41, 41, 8))
-    module = NECKS[kind](8)
+    module = NECKS[kind](num_groups=8)
     params = module.init(jax.random.key(0), x)
     # The norms pass a little of every change to all bins: count where far more arrives.
     y = module.apply(params, x)
