@@ -209,8 +209,7 @@ class Pairs(NamedTuple):
         return jnp.mean(total / jnp.maximum(jnp.sum(self.is_matched, axis=1), 1))
 
 
-def _focal(pairs: Pairs, options: LossOptions) -> Float[jax.Array, ""]:
-    del options
+def _focal(pairs: Pairs, _: LossOptions) -> Float[jax.Array, ""]:
     return focal_loss(pairs.logits, pairs.target)
 
 
@@ -222,8 +221,7 @@ def _gwd(pairs: Pairs, options: LossOptions) -> Float[jax.Array, ""]:
     return pairs.mean(gwd_loss(predicted, pairs.expected, tau, transform))
 
 
-def _smooth_l1(pairs: Pairs, options: LossOptions) -> Float[jax.Array, ""]:
-    del options
+def _smooth_l1(pairs: Pairs, _: LossOptions) -> Float[jax.Array, ""]:
     return pairs.mean(jnp.mean(smooth_l1(pairs.predicted - pairs.expected), -1))
 
 

@@ -139,9 +139,8 @@ class DeformableAttention(Layer):
         total = query_weights.sum(-1, keepdims=True)  # 0 for bins without a query
         return out + (total * jnp.expand_dims(bias, (0, 1))).astype(self.dtype)
 
-    def _ring(self, key: jax.Array, shape: tuple, dtype: Any = jnp.float32) -> Any:
+    def _ring(self, _: jax.Array, shape: tuple, dtype: Any = jnp.float32) -> Any:
         """Initializes the offsets: one direction per head, point i at i + 1 pixels."""
-        del key
         angle = 2 * math.pi * np.arange(self.num_heads) / self.num_heads
         way = np.stack([np.cos(angle), np.sin(angle)], -1)
         way = way / np.abs(way).max(-1, keepdims=True)

@@ -141,7 +141,6 @@ class RadeNet(nn.Module):
         Raises:
             UserError: The projection is not a batch or has the wrong number of channels.
         """
-        del train
         features = self._features(self._padded(projection))
         return self._maps(features, projection)
 
