@@ -12,6 +12,7 @@ import dataclasses
 
 import numpy as np
 from jaxtyping import Float
+from scipy.ndimage import median_filter  # type: ignore[attr-defined]
 
 from radejax.data.kradar import Frame
 from radejax.simulation.world import environments, scene
@@ -163,8 +164,7 @@ def infer_ego_speed(
     known = lower > 0.3 * usual  # slow vehicles ahead are weak evidence
     speed = np.where(known, lower, usual)
     speed = np.clip(speed, 0.0, np.maximum(np.minimum(upper, 40.0), 0.0))
-    padded = np.pad(speed, 10, mode="edge")
-    return np.median(np.lib.stride_tricks.sliding_window_view(padded, 21), axis=1)
+    return median_filter(speed, 21, mode="nearest")
 
 
 def _ground_height(tracks: Tracks) -> float:
