@@ -125,12 +125,9 @@ def moving_mean(values: Float[np.ndarray, " N"], width: int) -> Float[np.ndarray
     There are fewer values at the start. The mean is NaN if none is finite.
     """
     is_finite = np.isfinite(values)
-    total = np.cumsum(np.where(is_finite, values, 0.0))
-    count = np.cumsum(is_finite)
-    total[width:], count[width:] = (
-        total[width:] - total[:-width],
-        count[width:] - count[:-width],
-    )
+    rows = np.stack([np.where(is_finite, values, 0.0), is_finite])
+    sums = np.cumsum(np.pad(rows, ((0, 0), (width, 0))), axis=1)
+    total, count = sums[:, width:] - sums[:, :-width]
     return np.divide(total, count, out=np.full(values.shape, np.nan), where=count > 0)
 
 
