@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
 
 import chex
 import jax
@@ -37,7 +36,7 @@ _LOWEST_LEVEL = (10 * math.log10(2 * POWER_FLOOR) + LOG_OFFSET_DB) / LOG_SCALE_D
 
 
 def project_tensor(
-    tesseract: Real[np.ndarray, "D R E A"], *, dtype: Any = np.float32
+    tesseract: Real[np.ndarray, "D R E A"],
 ) -> Float[np.ndarray, "R A D+E"]:
     """Computes the tensor max projection of a 4D radar tensor in one pass over memory.
 
@@ -48,11 +47,9 @@ def project_tensor(
     Args:
         tesseract: Linear power of any real dtype and memory order. Column-major (as
             `scipy.io.loadmat` returns it) and C-contiguous arrays are the fastest.
-        dtype: Type of the result. The logarithm is computed in float32, or in float64
-            for float64 input.
 
     Returns:
-        The projection.
+        The float32 projection. The logarithm is computed in float64 for float64 input.
 
     Raises:
         UserError: The tesseract is not real or does not have four axes of at least one
@@ -75,18 +72,15 @@ def project_tensor(
     is_double = tesseract.dtype.type is np.float64
     tesseract = tesseract.astype(np.float64 if is_double else np.float32, copy=False)
     if tesseract.T.flags.c_contiguous:
-        return project_columns(tesseract.T, tesseract.shape, dtype=dtype)
-    projection = _empty(tesseract.shape, dtype)
+        return project_columns(tesseract.T, tesseract.shape)
+    projection = _empty(tesseract.shape)
     for row, out in zip(tesseract.swapaxes(0, 1), projection, strict=True):
         _project_slab(row, _row_maxima, out)
     return projection
 
 
 def project_columns(
-    columns: Iterable[Float[np.ndarray, "E R D"]],
-    shape_drea: tuple[int, ...],
-    *,
-    dtype: Any = np.float32,
+    columns: Iterable[Float[np.ndarray, "E R D"]], shape_drea: tuple[int, ...]
 ) -> Float[np.ndarray, "R A DE"]:
     """Computes `project_tensor` of a tesseract that is passed as slabs of one azimuth.
 
@@ -96,17 +90,16 @@ def project_columns(
         columns: C-contiguous slabs of linear power, one for every azimuth. All slabs may
             use the same buffer, as each is processed before the next is requested.
         shape_drea: Shape of the whole tesseract.
-        dtype: Type of the result.
     """
-    projection = _empty(shape_drea, dtype)
+    projection = _empty(shape_drea)
     for column, out in zip(columns, projection.swapaxes(0, 1), strict=True):
         _project_slab(column, _column_maxima, out)
     return projection
 
 
-def _empty(shape_drea: tuple[int, ...], dtype: Any) -> Float[np.ndarray, "R A DE"]:
+def _empty(shape_drea: tuple[int, ...]) -> Float[np.ndarray, "R A DE"]:
     doppler, range_, elevation, azimuth = shape_drea
-    return np.empty((range_, azimuth, doppler + elevation), dtype)
+    return np.empty((range_, azimuth, doppler + elevation), np.float32)
 
 
 def _project_slab(

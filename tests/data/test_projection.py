@@ -73,9 +73,8 @@ def test_equals_the_plain_formula(layout, dtype):
     found = project_tensor(tesseract)
     assert found.dtype == np.float32
     np.testing.assert_allclose(found, wanted, atol=1e-6, rtol=0)
-    exact = project_tensor(tesseract, dtype=np.float64)
-    tolerance = 1e-14 if dtype == np.float64 else 1e-6
-    np.testing.assert_allclose(exact, wanted, atol=tolerance, rtol=0)
+    if dtype == np.float64:  # computed in double precision, then rounded once
+        np.testing.assert_array_equal(found, wanted.astype(np.float32))
 
 
 def test_input_is_left_as_it_is():
@@ -125,8 +124,8 @@ def test_columns_one_by_one_in_the_same_buffer():
             buffer[:] = tesseract[..., i].T
             yield buffer
 
-    found = project_columns(columns(), SHAPE, dtype=np.float16)
-    np.testing.assert_array_equal(found, project_tensor(tesseract, dtype=np.float16))
+    found = project_columns(columns(), SHAPE)
+    np.testing.assert_array_equal(found, project_tensor(tesseract))
 
 
 def test_jax_on_one_frame_and_on_batches():

@@ -285,7 +285,7 @@ def test_released_projections_are_taken_as_input(root, tmp_path):
     wanted = {}
     for frame in KRadar(root):
         tesseract = read_tesseract(frame.tesseract_path)
-        projection = project_tensor(tesseract, dtype=np.float64)
+        projection = project_tensor(tesseract).astype(np.float64)
         folder = root / str(frame.sequence) / "DERA_tesseract"
         folder.mkdir(exist_ok=True)
         name = f"DERA_tesseract_{frame.header.radar:05d}.npy"

@@ -213,7 +213,7 @@ def test_wrong_content_is_named(tmp_path, tesseract):
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_released_projections(tmp_path, tesseract, dtype):
     path = tmp_path / "DERA_tesseract_00001.npy"
-    wanted = project_tensor(tesseract, dtype=dtype)
+    wanted = project_tensor(tesseract).astype(dtype)
     np.save(path, wanted.transpose(2, 0, 1))
     found = read_projection_npy(path, projection_shape=(6, 5, 7))
     np.testing.assert_array_equal(found, wanted)
