@@ -158,11 +158,16 @@ def detection_loss(
         sigma_mode=chosen.heatmap_sigma_mode,
         sigma_bins=chosen.heatmap_sigma_bins,
     )
+    # The bins of the predictions that are compared, their objects, and a mask of those
+    # that have one.
     if chosen.assignment == "center":
-        assigned = _at_centers(maps, boxes, is_valid, grid)
+        bins = grid.nearest_bin(boxes[..., 0], boxes[..., 1])  # [B, N, 2]
+        expected, is_matched = boxes, is_valid
     else:
-        assigned = _after_nms(chosen.decoding, maps, boxes, is_valid, grid)
-    predicted, expected, is_matched = assigned
+        bins, expected, is_matched = _after_nms(chosen, maps, boxes, is_valid, grid)
+    # A gather per frame needs no communication if the batch is sharded over devices.
+    gather = jax.vmap(lambda params, bins: params[bins[:, 0], bins[:, 1]])
+    predicted = grid.boxes_at(gather(maps.box_params, bins), bins)
     row = is_matched[..., None]
     pairs = Pairs(
         maps.heatmap_logits,
@@ -271,31 +276,20 @@ def _weighted_sum(
 
 # Assignment --------------------------------------------------------------------------
 
-Assigned = tuple[
-    Float[jax.Array, "B K 8"], Float[jax.Array, "B K 8"], Bool[jax.Array, "B K"]
-]
-"""Predicted boxes, their objects, and a mask of the boxes that have one.
-
-K is the number of objects, or of peaks for the assignment "nms".
-"""
-
-
-def _at_centers(
-    maps: DetectionMaps, boxes: Boxes8, is_valid: Mask, grid: RadarGrid
-) -> Assigned:
-    """Assigns to each object the prediction at its own bin."""
-    bins = grid.nearest_bin(boxes[..., 0], boxes[..., 1])  # [B, N, 2]
-    return _boxes_at(maps, bins, grid), boxes, is_valid
-
 
 def _after_nms(
-    decoding: DecodeOptions,
+    options: LossOptions,
     maps: DetectionMaps,
     boxes: Boxes8,
     is_valid: Mask,
     grid: RadarGrid,
-) -> Assigned:
-    """Assigns to each prediction that survives NMS the object that it overlaps most."""
+) -> tuple[Int[jax.Array, "B K 2"], Float[jax.Array, "B K 8"], Bool[jax.Array, "B K"]]:
+    """Assigns to each prediction that survives NMS the object that it overlaps most.
+
+    Returns:
+        Bins of K peaks, their objects, and a mask of the peaks that have one.
+    """
+    decoding = options.decoding
     # The selection of boxes is not differentiable.
     peaks = find_peaks(
         jax.lax.stop_gradient(maps),
@@ -308,13 +302,4 @@ def _after_nms(
     match = jax.vmap(match_boxes)
     object_idx, is_matched = match(peaks.boxes, keep, boxes, is_valid)
     expected = jax.vmap(lambda boxes, idx: boxes[idx])(boxes, object_idx)
-    return _boxes_at(maps, peaks.bins, grid), expected, is_matched
-
-
-def _boxes_at(
-    maps: DetectionMaps, bins: Int[jax.Array, "B N 2"], grid: RadarGrid
-) -> Boxes8:
-    """Returns the predicted boxes at given bins of every frame."""
-    # A gather per frame needs no communication if the batch is sharded over devices.
-    gather = jax.vmap(lambda params, bins: params[bins[:, 0], bins[:, 1]])
-    return grid.boxes_at(gather(maps.box_params, bins), bins)
+    return peaks.bins, expected, is_matched
