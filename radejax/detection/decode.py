@@ -25,7 +25,6 @@ from radejax.geometry.radar_grid import RadarGrid
 Scalar = float | Float[jax.Array, ""]
 Roi = Real[Array, "6"] | Sequence[Scalar]
 RawYaw = Literal["nms", "always", "never"]
-Boxes8 = Float[jax.Array, "*batch 8"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -165,13 +164,15 @@ def decode(
         roi=roi,
         threshold_inclusive=threshold_inclusive,
     )
-    clip = _with_positive_sizes if clip_sizes else lambda boxes: boxes
-    peaks = dataclasses.replace(peaks, boxes=clip(peaks.boxes))
+    least_m = MIN_SIZE_M if clip_sizes else -jnp.inf
+    boxes = peaks.boxes.at[..., 3:6].max(least_m)
+    peaks = dataclasses.replace(peaks, boxes=boxes)
     keep = suppress(
         peaks, nms_iou, per_class=per_class_nms, normalize_yaw=raw_yaw == "never"
     )
     if raw_yaw == "always":
-        boxes = clip(_with_raw_footprint(peaks.boxes))
+        length = jnp.linalg.norm(boxes[..., 6:8], axis=-1, keepdims=True)
+        boxes = boxes.at[..., 3:5].multiply(length).at[..., 3:6].max(least_m)
         peaks = dataclasses.replace(peaks, boxes=boxes)
     return _compact(peaks, keep, max_detections)
 
@@ -262,17 +263,6 @@ def find_peaks(
 
 _rows_at = jax.vmap(lambda rows, indices: rows[indices])
 """Rows of every frame: `[B, N, ...]` at `[B, K]` -> `[B, K, ...]`."""
-
-
-def _with_raw_footprint(boxes: Boxes8) -> Boxes8:
-    """Multiplies length and width by the length of the yaw vector."""
-    norm = jnp.linalg.norm(boxes[..., 6:8], axis=-1, keepdims=True)
-    return boxes.at[..., 3:5].multiply(norm)
-
-
-def _with_positive_sizes(boxes: Boxes8) -> Boxes8:
-    """Clips sizes to at least `MIN_SIZE_M`."""
-    return boxes.at[..., 3:6].max(MIN_SIZE_M)
 
 
 def _max_3x3(values: Float[jax.Array, "B R A C"]) -> Float[jax.Array, "B R A C"]:
