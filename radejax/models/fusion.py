@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Bool, Float, Real
+from jaxtyping import Float, Real
 
 from radejax.core.errors import BELOW_ONE, SIZE, check_options, integer, one_of
 from radejax.core.structures import Array
@@ -121,7 +121,10 @@ class Fusion(Part):
         seen = attention(per_bin(radar), per_bin(scale), points, means, camera)
         seen = seen.reshape(b, r, a, c)
         share = self._camera_share(radar, seen)
-        share = share * self._has_camera(reference, mean).astype(share.dtype)
+        has_camera = mean.sum(-1, keepdims=True) > 0  # bins with queries in the mean
+        if reference.has_image is not None:
+            has_camera &= jnp.asarray(reference.has_image)[:, None, None, None]
+        share = share * has_camera.astype(share.dtype)
         self.sow("intermediates", "camera_share", share.mean(-1))
         return dropout(share * seen + (1 - share) * radar)
 
@@ -138,12 +141,3 @@ class Fusion(Part):
             return nn.sigmoid(Dense(1, dtype=self.dtype, name="gate_out")(x))
         x = nn.relu(Dense(c, dtype=self.dtype, name="gate_hidden")(x))
         return 1 - nn.sigmoid(Dense(c, dtype=self.dtype, name="gate_out")(x))
-
-    def _has_camera(
-        self, reference: ReferencePoints, mean: Float[jax.Array, "B R A E"]
-    ) -> Bool[jax.Array, "_ R A 1"]:
-        """Returns True for bins with queries in the mean, in frames that have an image."""
-        has_camera = mean.sum(-1, keepdims=True) > 0
-        if reference.has_image is None:
-            return has_camera
-        return has_camera & jnp.asarray(reference.has_image)[:, None, None, None]
