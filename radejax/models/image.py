@@ -201,17 +201,17 @@ def _normalized(
 class Bottleneck(Layer):
     """Residual block of 1x1, 3x3 and 1x1 convolutions; the 3x3 convolution has the stride.
 
+    If the numbers of channels differ, the shortcut has a 1x1 convolution.
+
     Attributes:
         features: Channels of the first two convolutions; the output has four times as many.
         stride: Stride of the block.
-        is_first: Whether the block is the first of its stage, which projects its input.
         frozen: Whether to normalize with fixed statistics instead of batch normalization.
         dtype: Dtype of the computation and the output.
     """
 
     features: int
     stride: int
-    is_first: bool
     frozen: bool
 
     @nn.compact
@@ -225,7 +225,7 @@ class Bottleneck(Layer):
         y = nn.relu(block(x, self.features, 1, 1, "1"))
         y = nn.relu(block(y, self.features, 3, self.stride, "2"))
         y = block(y, 4 * self.features, 1, 1, "3")
-        if self.is_first:
+        if x.shape[-1] != 4 * self.features:
             x = block(x, 4 * self.features, 1, self.stride, "shortcut")
         return nn.relu(x + y)
 
@@ -235,9 +235,7 @@ def _stage(
 ) -> Iterator[Bottleneck]:
     """Yields the blocks of a stage, of which the first has the stride."""
     for i in range(depth):
-        yield Bottleneck(
-            stride=1 if i else stride, is_first=i == 0, name=f"{name}_{i + 1}", **fields
-        )
+        yield Bottleneck(stride=1 if i else stride, name=f"{name}_{i + 1}", **fields)
 
 
 class ResNetTrunk(Layer):

@@ -65,7 +65,7 @@ def test_frozen_normalization_by_its_formula():
 def test_bottleneck_by_its_parts():
     rng = np.random.default_rng(0)
     x = rng.standard_normal((1, 5, 6, 4)).astype(np.float32)
-    block = image_lib.Bottleneck(3, stride=2, is_first=True, frozen=True)
+    block = image_lib.Bottleneck(3, stride=2, frozen=True)
     variables = block.init(jax.random.key(0), jnp.asarray(x), False)
     params = jax.tree.map(
         lambda v: np.abs(v + 0.3 * rng.standard_normal(v.shape)).astype(np.float32),
