@@ -91,7 +91,10 @@ def _forward(x: jax.Array, kernel: jax.Array, dilation: int) -> tuple:
 def _backward(dilation: int, saved: tuple, grad: jax.Array) -> tuple:
     x, kernel = saved
     (grad_x,) = jax.vjp(lambda x: plain_conv2d(x, kernel, dilation), x)[1](grad)
-    plain = functools.partial(_kernel_gradient, kernel.shape[0], dilation)
+
+    def plain(x: Inputs, grad: Outputs) -> Kernel:
+        return jax.vjp(lambda k: plain_conv2d(x, k, dilation), kernel)[1](grad)[0]
+
     size, _, *channels = kernel.shape
     is_small = (
         x.shape[1] * x.shape[2] <= _MIN_BINS and math.prod(channels) <= _MIN_WEIGHTS
@@ -104,13 +107,6 @@ def _backward(dilation: int, saved: tuple, grad: jax.Array) -> tuple:
 
 
 conv2d.defvjp(_forward, _backward)
-
-
-def _kernel_gradient(
-    size: int, dilation: int, x: Inputs, grad: Outputs
-) -> Float[jax.Array, "{size} {size} C F"]:
-    kernel = jnp.zeros((size, size, x.shape[-1], grad.shape[-1]), x.dtype)
-    return jax.vjp(lambda k: plain_conv2d(x, k, dilation), kernel)[1](grad)[0]
 
 
 def blocked_kernel_gradient(
