@@ -113,32 +113,31 @@ def camera_inputs(
                 f"that is not embedded, the first is {absent[0]}; embed all of the data: "
                 "`radejax embed`"
             )
-    cameras: list[Camera] = []
-    sizes: list[tuple[int, int] | None] = []
+    views: list[tuple[Camera, tuple[int, int] | None]] = []
     missing: list[str] = []
     known: dict[Any, tuple[Camera, tuple[int, int]]] = {}
     for frame, image in zip(frames, sources, strict=True):
         if image is None or frame.camera_calibration_path is None:
             missing.append(frame.key)
-            cameras.append(no_camera(image_size))
-            sizes.append(None)
+            views.append((no_camera(image_size), None))
             continue
         shift = options.shift(frame.radar_from_lidar_m, frame.radar_from_lidar_z_m)
         source = frame.camera_calibration_path, shift
         if source not in known:
             known[source] = _camera(frame, shift, image_size, options)
-        cameras.append(known[source][0])
-        sizes.append(known[source][1])
-    count = f"{len(missing)} of {len(frames)} frames"
-    if missing and not options.allow_missing:
-        raise UserError(
-            f"{count} have no front image or no camera calibration, the first is "
-            f"{missing[0]}; config.data.camera.allow_missing=True uses only the radar there"
-        )
+        views.append(known[source])
     if missing:
-        what = "no front image or no camera calibration"
-        _log.warning("%s have %s: radar only", count, what)
-    return CameraInputs(tuple(cameras), image_size, options, features, sources, sizes)
+        count = f"{len(missing)} of {len(frames)} frames"
+        what = f"{count} have no front image or no camera calibration"
+        if not options.allow_missing:
+            raise UserError(
+                f"{what}, the first is {missing[0]}; "
+                "config.data.camera.allow_missing=True uses only the radar there"
+            )
+        _log.warning("%s: radar only", what)
+    cameras = tuple(camera for camera, _ in views)
+    sizes = [size for _, size in views]
+    return CameraInputs(cameras, image_size, options, features, sources, sizes)
 
 
 def _camera(
