@@ -7,8 +7,7 @@ them. It creates the scene of each sequence on request, procedurally or from lab
 from __future__ import annotations
 
 import collections
-import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt32
@@ -32,8 +31,7 @@ MIN_LIT = 0.15
 """Fraction of an object's power that must reach the radar unblocked for it to be visible."""
 
 
-@dataclasses.dataclass(frozen=True)
-class RadarInput:
+class RadarInput(NamedTuple):
     """Input from which one radar frame is computed.
 
     Attributes:
@@ -179,8 +177,7 @@ class SequenceSimulator:
 _FIRST_TIMESTAMP_S = 1.65e9
 
 
-@dataclasses.dataclass(frozen=True)
-class FrameSpec:
+class FrameSpec(NamedTuple):
     """One frame of a dataset before it is simulated.
 
     Attributes:

@@ -10,14 +10,13 @@ References:
 
 from __future__ import annotations
 
-import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image, ImageDraw
 
 
-@dataclasses.dataclass(frozen=True)
-class Air:
+class Air(NamedTuple):
     """Effects of one kind of weather on an image.
 
     Attributes:

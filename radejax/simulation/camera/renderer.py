@@ -7,8 +7,8 @@ vehicles and people appear at the pixels that correspond to their labels.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int32, UInt8
@@ -67,8 +67,7 @@ def stereo_calibration(
     )
 
 
-@dataclasses.dataclass(frozen=True)
-class Ground:
+class Ground(NamedTuple):
     """Intersections of a camera's viewing rays with the ground.
 
     Attributes:

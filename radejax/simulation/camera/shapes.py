@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -77,8 +77,7 @@ _NEAR_M = 0.3
 _SUN = np.array([0.35, 0.45, 0.82])
 
 
-@dataclasses.dataclass(frozen=True)
-class Polygon:
+class Polygon(NamedTuple):
     """A face projected into the image.
 
     Attributes:
@@ -118,8 +117,7 @@ def blocks_of(cls: str) -> Float[np.ndarray, "K 8 3"]:
     return np.stack(corners)
 
 
-@dataclasses.dataclass(frozen=True)
-class Light:
+class Light(NamedTuple):
     """Brightness and haze of a scene.
 
     Attributes:

@@ -32,8 +32,7 @@ References:
 
 from __future__ import annotations
 
-import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float, Inexact
@@ -44,8 +43,7 @@ from radejax.simulation.radar.tensor import RadarParameters
 Cells = Float[np.ndarray, "*cells"]
 
 
-@dataclasses.dataclass(frozen=True)
-class Surface:
+class Surface(NamedTuple):
     """Surface of the road.
 
     Attributes:
@@ -62,8 +60,7 @@ _WET = Surface(7.6 - 12.6j, 0.0004)
 _SNOW = Surface(1.6 - 0.01j, 0.004)
 
 
-@dataclasses.dataclass(frozen=True)
-class Weather:
+class Weather(NamedTuple):
     """Effects of one kind of weather on the received signal.
 
     Attributes:

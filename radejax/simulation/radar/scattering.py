@@ -23,7 +23,6 @@ References:
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -41,8 +40,7 @@ Values = Float[np.ndarray, " S"]
 Indices = Int[np.ndarray, " S"]
 
 
-@dataclasses.dataclass(frozen=True)
-class ClassScattering:
+class ClassScattering(NamedTuple):
     """Scattering properties of one class.
 
     Attributes:
