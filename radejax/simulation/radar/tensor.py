@@ -198,14 +198,11 @@ def simulate(
     """
     pedestal = parameters.array_pedestal
     elevation_rad = grid.elevation_rad if grid.num_elevation else np.zeros(1)
-    arrays = (
-        (elevation_rad, scatterers.elevation_rad, parameters.elevation_elements),
-        (grid.azimuth_rad, scatterers.azimuth_rad, parameters.azimuth_elements),
-    )
-    bases = [array_basis(axis, n, pedestal) for axis, _, n in arrays]
-    elevation, azimuth = (  # [M, S], [N, S]
-        array_signal(angle, n, pedestal) for _, angle, n in arrays
-    )
+    m, n = parameters.elevation_elements, parameters.azimuth_elements
+    elevation_basis = array_basis(elevation_rad, m, pedestal)
+    azimuth_basis = array_basis(grid.azimuth_rad, n, pedestal)
+    elevation = array_signal(scatterers.elevation_rad, m, pedestal)  # [M, S]
+    azimuth = array_signal(scatterers.azimuth_rad, n, pedestal)  # [N, S]
     doppler = doppler_response(scatterers.velocity_mps, grid)  # [D, S]
     in_range = range_response(scatterers.range_m, grid, parameters)  # [R, S]
     magnitude = jnp.linalg.norm(scatterers.amplitude, axis=-1)
@@ -221,22 +218,19 @@ def simulate(
         )  # [K, 2 N]
         received = _product(left.reshape(-1, num_kept), right)
         received += _noise(noise, key, row_idx, received.size).reshape(received.shape)
-        power = jnp.square(_beams(received, *bases)).sum(axis=2)  # [E, D, A]
+        beams = _beams(received, elevation_basis, azimuth_basis)
+        power = jnp.square(beams).sum(axis=2)  # [E, D, A]
         if output != "projection":
             return power
-        return grid.measured_channels(_project_row(power))
+        maxima = jnp.concatenate([power.max(axis=0), power.max(axis=1)], axis=0).T
+        levels = (10.0 * jnp.log10(maxima + POWER_FLOOR) + LOG_OFFSET_DB) / LOG_SCALE_DB
+        return grid.measured_channels(levels)  # [A, D+E]
 
     rows = (kept, in_range, noise_power, jnp.arange(grid.num_range, dtype=jnp.uint32))
 
     one_by_one = functools.partial(lax.map, row)
     in_batches = functools.partial(lax.map, row, batch_size=64)
     return lax.platform_dependent(rows, cpu=one_by_one, default=in_batches)
-
-
-def _project_row(power: Float[jax.Array, "E D A"]) -> Float[jax.Array, "A D+E"]:
-    """Computes the normalized projections of one range row."""
-    maxima = jnp.concatenate([power.max(axis=0), power.max(axis=1)], axis=0).T
-    return (10.0 * jnp.log10(maxima + POWER_FLOOR) + LOG_OFFSET_DB) / LOG_SCALE_DB
 
 
 def array_basis(
