@@ -82,11 +82,8 @@ def greedy_suppression(overlaps: Bool[jax.Array, "*batch K K"], is_valid: Mask) 
     def decide(keep: Mask) -> Mask:
         return is_valid & ~jnp.any(before & keep[..., :, None], axis=-2)
 
-    def changed(state: tuple[jax.Array, jax.Array]) -> Bool[jax.Array, ""]:
-        return jnp.any(state[0] != state[1])
-
     keep, _ = jax.lax.while_loop(
-        changed,
+        lambda state: jnp.any(state[0] != state[1]),
         lambda state: (decide(state[0]), state[0]),
         (decide(is_valid), is_valid),
     )
