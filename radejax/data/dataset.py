@@ -128,9 +128,8 @@ class LabelledFrame:
         """Reads the camera calibration, with the frame's own translation or a given one."""
         path = self.camera_calibration_path
         assert path is not None  # callers check it
-        calibration = CameraCalibration.from_kradar(
-            path, radar_from_lidar_m=radar_from_lidar_m or self.radar_from_lidar_m
-        )
+        shift_m = radar_from_lidar_m or self.radar_from_lidar_m
+        calibration = CameraCalibration.from_kradar(path, radar_from_lidar_m=shift_m)
         calibration.require_view_ahead(path)
         return calibration
 

@@ -69,11 +69,9 @@ class CameraInputs:
             return self.empty_images(1)[0]
         if self.features is not None:
             return self.features[source]
+        size = self.calibrated_sizes[index]
         return read_left_image(
-            source,
-            self.image_size,
-            resize=self.options.resize,
-            calibrated_size=self.calibrated_sizes[index],
+            source, self.image_size, resize=self.options.resize, calibrated_size=size
         )
 
 

@@ -263,9 +263,8 @@ def _bins_of_points(
         ground = np.hypot(x, y)
         polar = np.hypot(ground, z), -np.arctan2(y, x), -np.arctan2(z, ground)
         pairs = zip(polar, axes, strict=True)
-        stored = np.rint(
-            [np.interp(v, axis, np.arange(axis.size)) for v, axis in pairs]
-        )
+        places = [np.interp(v, axis, np.arange(axis.size)) for v, axis in pairs]
+        stored = np.rint(places)
     # NaN becomes bin 0. Then, as for bins outside the grid, the position is another one.
     bins = np.nan_to_num(np.clip(stored, 0, sizes - 1)).astype(np.intp)
     is_far = ~(np.abs(_points_at(bins, grid)[:3] - xyz) <= np.diff(axes[0]).min() / 2)

@@ -146,9 +146,8 @@ def check_dataset(
         row = _row(number, folder, own, splits)
         rows.append(row | {"radar_corrupted": corrupted[number]})
     names = [str(path) for path in data.roots]
-    return HealthReport(
-        names, data.version, rows, _count_objects(data, splits), summary
-    )
+    objects = _count_objects(data, splits)
+    return HealthReport(names, data.version, rows, objects, summary)
 
 
 def _tensors(folder: SequenceFolder) -> list[pathlib.Path]:

@@ -252,10 +252,8 @@ class KRadar(LabelledFrames[Frame]):
         """Reads the label files of a split and builds its frames."""
         self._summary = Summary()
         keys = self._select(split)
-        sequences = {
-            number: self._read_sequence(number)
-            for number in sorted({number for number, _ in keys})
-        }
+        numbers = sorted({number for number, _ in keys})
+        sequences = {number: self._read_sequence(number) for number in numbers}
         if self._weather is not None:
             number_before, chosen = len(keys), self._weather
             keys = [k for k in keys if sequences[k[0]]["weather"] in chosen]
@@ -495,11 +493,9 @@ class KRadar(LabelledFrames[Frame]):
         camera = folder.find("cam-front", f"cam-front_{header.camera_front:05d}.png")
         if folder.folders:
             if not (tesseract or projection):
-                self._report(
-                    "tesseract missing",
-                    f"{key[0]}/{key[1]}: no {wanted} in "
-                    + ", ".join(map(str, folder.folders)),
-                )
+                places = ", ".join(map(str, folder.folders))
+                message = f"{key[0]}/{key[1]}: no {wanted} in {places}"
+                self._report("tesseract missing", message)
             self.counts["frames without front image"] += camera is None
         return {
             "tesseract_path": tesseract,

@@ -56,9 +56,8 @@ def reduce_dataset(
     missing = [path for path in targets if not targets[path].exists()]
     if out.exists():
         form = find_release(find_sequences([out]))
-        require(
-            form in (None, release), f"form of the radar data in {out}", form, release
-        )
+        name = f"form of the radar data in {out}"
+        require(form in (None, release), name, form, release)
     if release == "rpc" and (done := targets.keys() - set(missing)):
         points, size = read_npy(targets[min(done)], mapped=True), polar_shape(grid)[1:]
         found = len(points) / math.prod(size)
