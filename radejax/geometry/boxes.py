@@ -29,11 +29,8 @@ def array_module(*values: Any) -> Any:
         >>> array_module(np.ones(3), 2.0) is np, array_module(jnp.ones(3)) is jnp
         (True, True)
     """
-    on_host = all(
-        isinstance(v, np.ndarray | np.generic | float | int | list | tuple)
-        for v in values
-    )
-    return np if on_host else jnp
+    host_types: Any = np.ndarray | np.generic | float | int | list | tuple
+    return np if all(isinstance(v, host_types) for v in values) else jnp
 
 
 def as_floats(*values: Any) -> tuple[Any, ...]:

@@ -256,10 +256,9 @@ class CameraCalibration(ArrayValues):
         The rotation is Rx(roll) Ry(pitch) Rz(yaw). A camera that looks straight ahead has
         yaw 90, pitch 0 and roll 90 degrees.
         """
-        rx, ry, rz = (
-            _rotation(axis, math.radians(angle_deg))
-            for axis, angle_deg in enumerate((roll_deg, pitch_deg, yaw_deg))
-        )
+        rx = _rotation(0, math.radians(roll_deg))
+        ry = _rotation(1, math.radians(pitch_deg))
+        rz = _rotation(2, math.radians(yaw_deg))
         return cls(
             intrinsics=np.asarray(intrinsics),
             distortion=np.asarray(distortion),
