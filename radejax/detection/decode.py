@@ -237,10 +237,8 @@ def find_peaks(
         raise ValueError(f"at least 1 peak must enter NMS, got {max_peaks}")
     num_azimuth = maps.heatmap_logits.shape[2]
     scores = jax.nn.sigmoid(maps.heatmap_logits.astype(jnp.float32))
-    above = (
-        scores >= score_threshold if threshold_inclusive else scores > score_threshold
-    )
-    is_peak = above & (scores >= _max_3x3(scores))
+    passes = jnp.greater_equal if threshold_inclusive else jnp.greater
+    is_peak = passes(scores, score_threshold) & (scores >= _max_3x3(scores))
     scores = jnp.where(is_peak, scores, 0.0)
     best = jnp.max(scores, axis=-1)  # [B, R, A]
     if roi is not None:
