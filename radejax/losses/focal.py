@@ -90,10 +90,7 @@ def gaussian_heatmap(
     columns = azimuth_profile[..., :, None] * one_hot[..., None, :]  # [..., N, A, C]
     # In an accelerator's reduced precision, values at the centers might not be exactly 1.
     heatmap = jnp.einsum(
-        "...nr,...nac->...rac",
-        range_profile,
-        columns,
-        precision=jax.lax.Precision.HIGHEST,
+        "...nr,...nac->...rac", range_profile, columns, precision="highest"
     )
     # The barrier prevents the compiler from fusing the sum separately into each of its
     # uses. Rounding then differs, and a sum near 1 counts as positive in one use but not
