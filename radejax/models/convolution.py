@@ -96,9 +96,8 @@ def _backward(dilation: int, saved: tuple, grad: jax.Array) -> tuple:
         return jax.vjp(lambda k: plain_conv2d(x, k, dilation), kernel)[1](grad)[0]
 
     size, _, *channels = kernel.shape
-    is_small = (
-        x.shape[1] * x.shape[2] <= _MIN_BINS and math.prod(channels) <= _MIN_WEIGHTS
-    )
+    num_bins = x.shape[1] * x.shape[2]
+    is_small = num_bins <= _MIN_BINS and math.prod(channels) <= _MIN_WEIGHTS
     if size == 1 or is_small:
         return grad_x, plain(x, grad)
     blocked = functools.partial(blocked_kernel_gradient, size=size, dilation=dilation)

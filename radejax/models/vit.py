@@ -356,8 +356,7 @@ def _attend_blocked(query: PerHead, key: PerHead, value: PerHead) -> PerHead:
 
         return jax.lax.map(one_block, blocks)
 
-    out = jax.lax.map(
-        one_head, (queries, by_head(key), by_head(value).swapaxes(1, 2))
-    )  # [B * heads, n, d, block]
+    arrays = queries, by_head(key), by_head(value).swapaxes(1, 2)
+    out = jax.lax.map(one_head, arrays)  # [B * heads, n, d, block]
     out = out.swapaxes(2, 3).reshape(b, heads, -1, d)[:, :, :t]
     return out.swapaxes(1, 2)
