@@ -341,9 +341,8 @@ def _add_legend(
     if scene.roi is not None:
         named = [name for name, roi in ROIS.items() if roi == tuple(scene.roi)]
         label = f"{named[0]} region" if named else "region of interest"
-        handles.append(
-            Line2D([], [], color=style.ROI_COLOR, lw=1.4, ls="--", label=label)
-        )
+        line = Line2D([], [], color=style.ROI_COLOR, lw=1.4, ls="--", label=label)
+        handles.append(line)
     # Counts, threshold and region fit in this font size.
     owner.legend(handles=handles, fontsize=8, frameon=False, **place)
 
@@ -398,9 +397,8 @@ def draw_slices(scene: Scene, *, range_idx: int | None = None) -> Figure:
             left, right = ax.get_xlim()
             lines = [np.add(bar, [left + 0.02 * (right - left), 0.0]) for bar in lines]
         # Lines are thinner here, as most boxes only cover a few bins.
-        style.draw_lines(
-            ax, lines, style.GROUND_TRUTH.color, 0.7 * style.GROUND_TRUTH.width
-        )
+        look = style.GROUND_TRUTH
+        style.draw_lines(ax, lines, look.color, 0.7 * look.width)
     figure.suptitle(scene.title)
     return figure
 
@@ -416,9 +414,8 @@ def _outlines(
         height = np.rad2deg(np.arctan2(points[:, 2], ground[:, 1]))
         x0, x1 = ground[:, 0].min(), ground[:, 0].max()
         y0, y1 = height.min(), height.max()
-        azimuth_elevation.append(
-            np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]])
-        )
+        rectangle = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]])
+        azimuth_elevation.append(rectangle)
         ranges = outline[:, 1]
         bars.append(np.array([[0.0, ranges.min()], [0.0, ranges.max()]]))
     return azimuth_range, bars, azimuth_elevation
