@@ -79,9 +79,8 @@ class SequenceSimulator:
         self.parameters, self.seed = parameters, seed
         rng = np.random.default_rng([seed, sequence.name, 11])
         tracks = sequence.tracks
-        self._centers = scattering.make_object_scatterers(
-            tracks.cls, np.median(tracks.size_m, axis=0), rng
-        )
+        sizes_m = np.median(tracks.size_m, axis=0)
+        self._centers = scattering.make_object_scatterers(tracks.cls, sizes_m, rng)
         count = len(sequence.reflectors.kind)
         self._static_phase = rng.uniform(0.0, 2.0 * np.pi, count)
 

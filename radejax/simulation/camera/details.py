@@ -53,9 +53,8 @@ _HAIR = (48.0, 38.0, 32.0)
 
 def _pair(block, face, u, v, color, other=None) -> list[Detail]:
     """Returns a detail and its mirror image on the same face or on face `other`."""
-    mirrored = Detail(
-        block, face if other is None else other, (1.0 - u[1], 1.0 - u[0]), v, color
-    )
+    opposite = face if other is None else other
+    mirrored = Detail(block, opposite, (1.0 - u[1], 1.0 - u[0]), v, color)
     return [Detail(block, face, u, v, color), mirrored]
 
 

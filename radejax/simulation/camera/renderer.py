@@ -276,9 +276,8 @@ class CameraRenderer:
             snow = (self.air.white * (0.35 + 0.65 * tracks))[:, None]
             asphalt = _ASPHALT * (1.0 - 0.3 * self.air.wetness)
             asphalt = asphalt + 14.0 * grain[:, None]
-            color = np.where(
-                on_road[:, None], asphalt + snow * (_SNOW - asphalt), color
-            )
+            surface = asphalt + snow * (_SNOW - asphalt)
+            color = np.where(on_road[:, None], surface, color)
             dashed = np.mod(along, 12.0) < 5.0
             width = 0.09 + depth * 0.0012  # at least a pixel far away
             on_line = np.zeros(x.size, bool)
@@ -294,8 +293,7 @@ def _hash_noise(
     i: Float[np.ndarray, "*all"], j: Float[np.ndarray, "*all"]
 ) -> Float[np.ndarray, "*all"]:
     """Computes uniform numbers in [0, 1) as a hash of two integers."""
-    bits = (
-        i.astype(np.int64) * 374761393 + j.astype(np.int64) * 668265263
-    ) & 0xFFFFFFFF
+    bits = i.astype(np.int64) * 374761393 + j.astype(np.int64) * 668265263
+    bits &= 0xFFFFFFFF
     bits = ((bits ^ (bits >> 13)) * 1274126177) & 0xFFFFFFFF
     return ((bits ^ (bits >> 16)) & 0xFFFF) / 65536.0

@@ -180,9 +180,8 @@ def visible_polygons(
 
 def camera_position(calibration: CameraCalibration) -> Float[np.ndarray, "3"]:
     """Returns the position of the camera in the radar frame."""
-    return calibration.radar_from_lidar_m - (
-        calibration.rotation.T @ calibration.translation_m
-    )
+    to_ego = calibration.rotation.T
+    return calibration.radar_from_lidar_m - to_ego @ calibration.translation_m
 
 
 def _object_faces(boxes, classes, colors, origin) -> Faces:

@@ -120,9 +120,8 @@ def noise_profile(
     beam = (2.4 / parameters.azimuth_elements) * (2.4 / parameters.elevation_elements)
     distance = np.maximum(grid.range_m, 1.0)
     volume = distance**2 * beam * grid.range_widths_m
-    clutter = 10.0 ** ((parameters.gain_db + law.backscatter_db) / 10.0) * (
-        volume / distance**4 * attenuation(weather, distance)
-    )
+    gain = 10.0 ** ((parameters.gain_db + law.backscatter_db) / 10.0)
+    clutter = gain * (volume / distance**4 * attenuation(weather, distance))
     share = np.ones(1)
     if grid.num_doppler > 1:
         step = grid.doppler_mps[1] - grid.doppler_mps[0]

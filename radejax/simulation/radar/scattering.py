@@ -119,10 +119,8 @@ def make_object_scatterers(
     """
     flat, vector = np.zeros(0), np.zeros((0, 3))
     none = ObjectScatterers(flat.astype(int), vector, vector, *[flat] * 5)
-    parts = (
-        _one_object(i, CLASSES[c], size, rng)
-        for i, (c, size) in enumerate(zip(cls, size_m, strict=True))
-    )
+    objects = enumerate(zip(cls, size_m, strict=True))
+    parts = (_one_object(i, CLASSES[c], size, rng) for i, (c, size) in objects)
     return ObjectScatterers(*map(np.concatenate, zip(none, *parts, strict=True)))
 
 
@@ -247,9 +245,8 @@ def scatter_objects(
         turning * (frame.index * scene.FRAME_PERIOD_S) + centers.micro_phase_rad[used]
     )
     velocity = frame.velocity_mps[owner] * (1.0 + swing[:, None])
-    scattering = FrameScattering(
-        position, velocity, power, centers.phase_rad[used], owner
-    )
+    phase_rad = centers.phase_rad[used]
+    scattering = FrameScattering(position, velocity, power, phase_rad, owner)
     return scattering, lit / np.maximum(total, 1e-30)
 
 
@@ -324,13 +321,9 @@ def scatter_surroundings(
     owner = np.full(len(position), -1)
     blocked = scene.is_blocked(position, frame.boxes, owner)
     power = np.where(blocked, power * 10.0 ** (OCCLUDED_DB / 10.0), power)
-    return FrameScattering(
-        position,
-        np.zeros((len(position), 2)),
-        power,
-        phase_rad[frame.reflector_idx],
-        owner,
-    )
+    at_rest = np.zeros((len(position), 2))
+    phase_rad = phase_rad[frame.reflector_idx]
+    return FrameScattering(position, at_rest, power, phase_rad, owner)
 
 
 MIRROR_DB = -18.0

@@ -267,9 +267,8 @@ def array_signal(
     turn = jnp.pi * place.astype(np.float32)[:, None] * jnp.sin(angle_rad)[None]
     both = jnp.concatenate([jnp.cos(turn), jnp.sin(turn)[place > 0]])
     pairs = np.where(place > 0, 1.0, np.sqrt(0.5))  # the middle element has no partner
-    scale = np.concatenate([pairs, pairs[place > 0]]) * (
-        np.linalg.norm(weight) / np.sum(weight * pairs)
-    )
+    gain = np.linalg.norm(weight) / np.sum(weight * pairs)
+    scale = np.concatenate([pairs, pairs[place > 0]]) * gain
     return scale.astype(np.float32)[:, None] * both
 
 

@@ -174,9 +174,8 @@ def _ground_height(tracks: Tracks) -> float:
     wrong height.
     """
     bottom = tracks.position_m[..., 2] - tracks.size_m[..., 2] / 2.0
-    near = tracks.is_present & (
-        np.hypot(tracks.position_m[..., 0], tracks.position_m[..., 1]) < 30.0
-    )
+    distance = np.hypot(tracks.position_m[..., 0], tracks.position_m[..., 1])
+    near = tracks.is_present & (distance < 30.0)
     if not near.any():
         return environments.GROUND_M
     return float(np.clip(np.median(bottom[near]), -1.4, -0.4))

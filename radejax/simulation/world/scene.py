@@ -164,18 +164,15 @@ class Sequence:
         """Returns the objects and reflectors at frame `index` up to a maximum distance."""
         pose, tracks, fixed = self.ego_pose[index], self.tracks, self.reflectors
         centers = _to_ego(tracks.position_m[index], pose)
-        chosen = np.flatnonzero(
-            tracks.is_present[index]
-            & (np.hypot(centers[:, 0], centers[:, 1]) < max_distance_m)
-        )
+        is_near = np.hypot(centers[:, 0], centers[:, 1]) < max_distance_m
+        chosen = np.flatnonzero(tracks.is_present[index] & is_near)
         yaw = wrap_angle(tracks.yaw_rad[index] - pose[2])
         boxes = np.concatenate([centers, tracks.size_m[index], yaw[:, None]], 1)
         points = _to_ego(fixed.position_m, pose)
         distance = np.hypot(points[:, 0], points[:, 1])
         # The ego vehicle blocks the view to the rear, and nothing is within 2 m of the radar.
-        seen = np.flatnonzero(
-            (points[:, 0] > 0) & (distance < max_distance_m) & (distance > 2.0)
-        )
+        is_near = (distance > 2.0) & (distance < max_distance_m)
+        seen = np.flatnonzero((points[:, 0] > 0) & is_near)
         velocity = tracks.velocity_mps[index, chosen]
         return SceneFrame(
             boxes=boxes[chosen],
