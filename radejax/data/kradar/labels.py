@@ -241,10 +241,7 @@ def _parse_object(line: str, version: str) -> Label:
             f"all up to {_MAX_NUMBER:g}"
         )
     length, width, height = (2.0 * half for half in half_extents)
+    box = (x, y, z, length, width, height, math.radians(yaw_deg))
     fields = match.groupdict()
-    return Label(
-        fields["cls"],
-        (x, y, z, length, width, height, math.radians(yaw_deg)),
-        fields.get("visibility", "R"),
-        int(fields["track_id"]),
-    )
+    visibility = fields.get("visibility", "R")
+    return Label(fields["cls"], box, visibility, int(fields["track_id"]))
