@@ -142,16 +142,12 @@ def blocked_kernel_gradient(
         block = jnp.pad(block, ((0, 0), (padding, padding), (0, 0)))
         # Taps along azimuth shift the map; taps along range shift rows of the gradient.
         taps = jnp.concatenate([block[:, o : o + a] for o in offsets], -1)
-        turned = [
-            jax.lax.dynamic_slice(
-                grad,
-                (image, start + 2 * padding - o, 0, 0),
-                (1, rows, *grad.shape[2:]),
-            )[0].swapaxes(0, 1)
-            for o in offsets
-        ]
+        shape = (1, rows, *grad.shape[2:])
+        starts = [(image, start + 2 * padding - o, 0, 0) for o in offsets]
+        parts = [jax.lax.dynamic_slice(grad, at, shape)[0] for at in starts]
+        turned = jnp.concatenate([part.swapaxes(0, 1) for part in parts])
         product = jax.lax.dot_general(
-            jnp.concatenate(turned).reshape(-1, rows * a),
+            turned.reshape(-1, rows * a),
             taps.reshape(rows * a, -1),
             (((1,), (0,)), ((), ())),
             preferred_element_type=jnp.float32,

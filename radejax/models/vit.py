@@ -181,10 +181,9 @@ class Block(nn.Module):
         b, t, c = x.shape
         # DINOv3 has no bias of the key, and DINOv2's does not change the result: without
         # rotation it adds the same to all scores of a query.
+        shape = b, t, self.num_heads, -1
         query, key, value = (
-            self._dense(c, name, use_bias=name != "key")(x).reshape(
-                b, t, self.num_heads, -1
-            )
+            self._dense(c, name, use_bias=name != "key")(x).reshape(shape)
             for name in ("query", "key", "value")
         )  # [B, T, heads, C / heads]
         if rope is not None:
