@@ -212,12 +212,9 @@ def draw_scenes(scenes: Sequence[Scene]) -> Figure:
             below.set_ylabel("")
         (above or below).set_title(scene.title, fontsize=11)
     place = (1 - 3.3 / width, 0.42 / height, 2.7 / width, 0.11 / height)
-    bar = figure.colorbar(
-        ScalarMappable(Normalize(*limits), style.COLOR_MAP),
-        cax=figure.add_axes(place),
-        orientation="horizontal",
-        extend="both",
-    )
+    cax = figure.add_axes(place)
+    colors = ScalarMappable(Normalize(*limits), style.COLOR_MAP)
+    bar = figure.colorbar(colors, cax=cax, orientation="horizontal", extend="both")
     bar.set_label(POWER_LABEL, fontsize=8)
     bar.ax.tick_params(labelsize=8)
     _add_legend(
