@@ -92,11 +92,9 @@ class SequenceSimulator:
         ghosts = scattering.scatter_ghosts(objects, sequence.mirrors_m)
         kinds = zip(objects, static, ghosts, strict=True)
         found = scattering.FrameScattering(*map(np.concatenate, kinds))
+        surface = propagation.WEATHERS[sequence.weather].surface
         bounce = propagation.bounce(
-            found.position_m,
-            sequence.ground_m,
-            propagation.WEATHERS[sequence.weather].surface,
-            parameters.wavelength_m,
+            found.position_m, sequence.ground_m, surface, parameters.wavelength_m
         )
         # The cross-section of the ground already includes its reflections.
         is_ground = frame.reflectors.kind == scene.REFLECTOR_KINDS.index("ground")
@@ -162,14 +160,10 @@ class SequenceSimulator:
         for n in np.flatnonzero(distance < max_distance_m):
             box = frame.boxes[n].copy()
             box[:3] -= radar_from_lidar_m
-            labels.append(
-                Label(
-                    cls=tracks.label_cls[frame.track[n]],
-                    box=tuple(box.tolist()),
-                    visibility="R" if visible[n] else "L",
-                    track_id=int(tracks.track_id[frame.track[n]]),
-                )
-            )
+            track = frame.track[n]
+            cls, track_id = tracks.label_cls[track], int(tracks.track_id[track])
+            visibility = "R" if visible[n] else "L"
+            labels.append(Label(cls, tuple(box.tolist()), visibility, track_id))
         return labels
 
 

@@ -359,10 +359,8 @@ def scatter_ghosts(
     position[:, 1] = 2.0 * plane - position[:, 1]
     mirrored = np.linalg.norm(position, axis=1)
     loss = 10.0 ** (MIRROR_DB / 10.0) * (direct / mirrored) ** 4
-    return FrameScattering(
-        position,
-        objects.velocity_mps[chosen] * (1.0, -1.0),
-        objects.power[chosen] * loss,
-        objects.phase_rad[chosen] + plane,
-        np.full(len(chosen), -1),
-    )
+    velocity = objects.velocity_mps[chosen] * (1.0, -1.0)
+    power = objects.power[chosen] * loss
+    phase_rad = objects.phase_rad[chosen] + plane
+    no_owner = np.full(len(chosen), -1)
+    return FrameScattering(position, velocity, power, phase_rad, no_owner)
