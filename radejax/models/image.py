@@ -260,15 +260,11 @@ class ResNetTrunk(Layer):
         x = _conv(self.width, 7, 2, self.dtype, "stem_conv")(image)
         x = nn.relu(_normalized(x, "stem_norm", self.frozen, self.dtype, train))
         x = nn.max_pool(x, (3, 3), (2, 2), ((1, 1), (1, 1)))
+        fields: dict[str, Any] = {"frozen": self.frozen, "dtype": self.dtype}
         for stage, depth in enumerate(self.depths, 1):
-            for block in _stage(
-                f"stage_{stage}_block",
-                depth,
-                stride=1 if stage == 1 else 2,
-                features=self.width * 2 ** (stage - 1),
-                frozen=self.frozen,
-                dtype=self.dtype,
-            ):
+            stride = 1 if stage == 1 else 2
+            fields["features"] = self.width * 2 ** (stage - 1)
+            for block in _stage(f"stage_{stage}_block", depth, stride=stride, **fields):
                 x = block(x, train)
         return x.astype(jnp.float32)
 
