@@ -124,12 +124,11 @@ def _drop_mask(size, share: float, rng: np.random.Generator) -> Image.Image:
     width, height = 160, 90
     mask = Image.new("L", (width, height), 0)
     draw = ImageDraw.Draw(mask)
-    covered, tries = 0.0, 0
-    while covered < share and tries < 400:
+    for count in range(1, 401):
         x, y = rng.uniform(0, width), rng.uniform(0, height)
         radius = rng.uniform(2.0, 9.0) * (1.0 + share)
         draw.ellipse((x - radius, y - radius, x + radius, y + 1.15 * radius), fill=255)
-        covered = float(np.asarray(mask).mean()) / 255.0 if tries % 8 == 7 else covered
-        tries += 1
+        if count % 8 == 0 and np.asarray(mask).mean() / 255.0 >= share:
+            break
     small = mask.resize((width // 2, height // 2), Image.Resampling.BOX)
     return small.resize(size, Image.Resampling.BICUBIC)
