@@ -197,9 +197,7 @@ def strongest_points(
     return points_of_bins(bins, power[bins], doppler[bins], grid)
 
 
-def to_polar(
-    frame: Real[np.ndarray, "..."], grid: RadarGrid, name: str = "frame"
-) -> Polar:
+def to_polar(frame: Real[np.ndarray, "..."], grid: RadarGrid, name: str) -> Polar:
     """Converts the data of one `polar3d` or `rpc` file to a `polar3d` array.
 
     Cells without a point have no power. Points `[N, 5]` at range 0 are left out.

@@ -230,9 +230,7 @@ class Bottleneck(Layer):
         return nn.relu(x + y)
 
 
-def _stage(
-    name: str, depth: int, *, stride: int, **fields: Any
-) -> Iterator[Bottleneck]:
+def _stage(name: str, depth: int, stride: int, **fields: Any) -> Iterator[Bottleneck]:
     """Yields the blocks of a stage, of which the first has the stride."""
     for i in range(depth):
         yield Bottleneck(stride=1 if i else stride, name=f"{name}_{i + 1}", **fields)

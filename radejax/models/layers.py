@@ -184,10 +184,8 @@ class GroupNorm(Layer):
         x = x.astype(jnp.float32)
         group_size = c // self.num_groups
 
-        def over_group(
-            per_channel: Float[jax.Array, "B C"],
-        ) -> Float[jax.Array, "B 1 1 C"]:
-            per_group = per_channel.reshape(b, self.num_groups, -1).sum(-1)
+        def over_group(sums: Float[jax.Array, "B C"]) -> Float[jax.Array, "B 1 1 C"]:
+            per_group = sums.reshape(b, self.num_groups, -1).sum(-1)
             per_group = per_group / (r * a * group_size)
             return jnp.repeat(per_group, group_size, -1)[:, None, None]
 
