@@ -14,8 +14,6 @@ import radejax
 from radejax.cli import entry
 from radejax.core.errors import UserError
 
-ANIMATIONS = (".gif", ".mp4")
-
 MODEL = pathlib.Path(__file__).with_name("demo_model")
 """Model of the quickstart with seed 0; docs/detector.md lists the commands that made it."""
 
@@ -25,7 +23,7 @@ MODEL = pathlib.Path(__file__).with_name("demo_model")
 @entry.several("--data", "roots", required=True, help="Roots of K-Radar.")
 @entry.labelled_frames
 @entry.camera_calibration
-@entry.out_file("overlay.png", "Image file, or .gif or .mp4 for several frames.")
+@entry.out_file("overlay.png", "Image file, or .gif for several frames.")
 @click.option(
     "--slices",
     is_flag=True,
@@ -56,7 +54,7 @@ def overlay(
     """Draw one frame's labels on radar and camera: the first look at new data.
 
     FRAME is sequence/radar_lidar, sequence/radar, or one sequence, of which the first
-    frame is drawn. All frames are drawn where --out ends in .gif or .mp4.
+    frame is drawn. All frames are drawn where --out ends in .gif.
     --sequences and --weather select frames without a FRAME. Labels of every visibility
     are drawn, also those that training leaves out.
 
@@ -89,7 +87,7 @@ def overlay(
             f"no frame {frame_name} in sequence {sequence}; there are "
             f"{frames[0].name} to {frames[-1].name}"
         )
-    is_animation = out.suffix.lower() in ANIMATIONS
+    is_animation = out.suffix.lower() == ".gif"
     found = found[: max_frames if is_animation else 1]
     if is_animation:
         shown = tqdm.tqdm(found, "draw", unit="frame")

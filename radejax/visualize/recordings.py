@@ -1,4 +1,4 @@
-"""Sequences of frames as GIF, MP4 (if ffmpeg is installed) and rerun recordings.
+"""Sequences of frames as GIF and rerun recordings.
 
 Recordings show radar map, boxes and camera over time. Only they need the extra `viewer`
 (`pip install radejax[viewer]`).
@@ -6,18 +6,17 @@ Recordings show radar map, boxes and camera over time. Only they need the extra 
 
 from __future__ import annotations
 
-import itertools
 import os
 import pathlib
-import subprocess
 from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
-from matplotlib.animation import FFMpegWriter, PillowWriter
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from PIL import Image
 
 from radejax.core.errors import UserError
 from radejax.core.files import as_path, atomic_path
@@ -31,54 +30,43 @@ def animate(
     *,
     frames_per_second: float = 10.0,
 ) -> pathlib.Path:
-    """Write figures as the frames of a GIF or MP4 file, which is replaced atomically.
+    """Write figures as the frames of a GIF file, which is replaced atomically.
 
     Args:
-        figures: Figures or a generator of figures, written at the size and resolution of
-            the first one.
-        path: File to write, with the suffix .gif, or .mp4, which needs ffmpeg.
+        figures: Figures or a generator of figures, written at the size of the first one.
+        path: File to write, with the suffix .gif.
         frames_per_second: Frame rate; K-Radar's sensors have 10 frames per second.
 
     Returns:
         The path of the file.
 
     Raises:
-        UserError: The suffix is not supported, there are no figures, or ffmpeg is missing
-            or fails.
+        UserError: The suffix is not .gif, or there are no figures.
     """
     path = as_path(path)
-    writer: PillowWriter | FFMpegWriter
-    if path.suffix.lower() == ".gif":
-        writer = PillowWriter(frames_per_second)  # type: ignore[arg-type]
-    elif path.suffix.lower() != ".mp4":
-        raise UserError(f"animations are written as .gif or .mp4, got {path.name!r}")
-    elif not FFMpegWriter.isAvailable():
-        raise UserError(
-            "writing .mp4 needs the ffmpeg program, which is not on the PATH; install "
-            "it (apt install ffmpeg, conda install ffmpeg) or write a .gif"
-        )
-    else:
-        writer = FFMpegWriter(frames_per_second, "h264")  # type: ignore[arg-type]
-    remaining = iter(figures)
-    first = next(remaining, None)
+    if path.suffix.lower() != ".gif":
+        raise UserError(f"animations are written as .gif, got {path.name!r}")
+    images = map(_image_of, figures)
+    first = next(images, None)
     if first is None:
         raise UserError("no frames to animate")
     with atomic_path(path) as temporary:
-        # Both writers select the format by the suffix.
-        target = temporary.with_name(f"{temporary.name}{path.suffix.lower()}")
-        try:
-            with writer.saving(first, str(target), first.dpi):
-                for figure in itertools.chain([first], remaining):
-                    figure.set_size_inches(*first.get_size_inches())
-                    writer.fig = figure
-                    writer.grab_frame()
-            os.replace(target, temporary)
-        except subprocess.CalledProcessError as error:
-            lines = error.stderr.strip().splitlines() or ["no message"]
-            raise UserError(f"ffmpeg could not write the video: {lines[-1]}") from error
-        finally:
-            target.unlink(missing_ok=True)
+        first.save(
+            temporary,
+            "gif",
+            save_all=True,
+            append_images=(image.resize(first.size) for image in images),
+            duration=1000.0 / frames_per_second,
+            loop=0,
+        )
     return path
+
+
+def _image_of(figure: Figure) -> Image.Image:
+    """Return a figure as an image."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
 
 
 def write_recording(scenes: Iterable[Scene], path: str | os.PathLike) -> None:
