@@ -291,9 +291,7 @@ def write_boxes(path: PathLike, boxes: Boxes, frames: Columns) -> None:
         ...     np.load(path)["frame"].tolist()
         ['1/00033_00001']
     """
-    columns = {
-        name: column for name, column in vars(boxes).items() if column is not None
-    }
+    columns = {k: v for k, v in vars(boxes).items() if v is not None}
     if "name" in frames:
         position = frame_positions(boxes.frame, frame_ids(frames), str(path))
         columns["frame"] = np.array(frame_keys(frames), dtype=str)[position]
@@ -316,10 +314,8 @@ def frame_keys(frames: Columns) -> list[str]:
     names = [str(name).removesuffix(".txt") for name in frames["name"]]
     if "sequence" not in frames:
         return names
-    return [
-        name if "/" in name else f"{sequence}/{name}"
-        for name, sequence in zip(names, frames["sequence"], strict=True)
-    ]
+    pairs = zip(frames["sequence"], names, strict=True)
+    return [name if "/" in name else f"{number}/{name}" for number, name in pairs]
 
 
 def with_ids(

@@ -259,9 +259,8 @@ def comparison_tables(
         for row in group:
             protocol = f"{row.protocol}, score>{row.score_threshold:g}"
             metric = f"{row.space.upper()} {row.iou:g}"
-            gap, low, high = report.numbers(
-                (row.difference, row.low, row.high), signed=True
-            )
+            ends = row.difference, row.low, row.high
+            gap, low, high = report.numbers(ends, signed=True)
             verdict = []
             if is_tested:
                 gap += f" ± {report.number(row.std)}"
@@ -304,9 +303,8 @@ def compare_files(
         raise UserError("--bootstrap=0: a comparison needs 1 resample or more")
     folders = [report_folders(path) for path in paths]
     # Predictions below the lowest stored score of one run must not count for another run.
-    stored = (
-        stored_options(x).get("min_score", 0) for y in folders for x in y.values()
-    )
+    seeds = [seed for run in folders for seed in run.values()]
+    stored = (stored_options(seed).get("min_score", 0) for seed in seeds)
     options = dataclasses.replace(options, min_score=max(options.min_score, *stored))
     names = [str(path) for path in paths]
     (first, frames), *others = [_load_run(run, source, options) for run in folders]

@@ -177,12 +177,9 @@ class EvaluationSet:
         position = boxes.frame_positions(table.frame, self.frame, name)
         cls = boxes.class_indices(table, self.classes, name)
         is_class, is_inside = cls >= 0, boxes.in_roi(table.box, self._roi)
-        self.left_out |= {
-            f"{name}: class not evaluated": int((~is_class).sum()),
-            f"{name}: center outside the region of interest": int(
-                (is_class & ~is_inside).sum()
-            ),
-        }
+        num_outside = int((is_class & ~is_inside).sum())
+        self.left_out[f"{name}: class not evaluated"] = int((~is_class).sum())
+        self.left_out[f"{name}: center outside the region of interest"] = num_outside
         row = np.flatnonzero(is_class & is_inside)
         row = row[np.lexsort((row, cls[row], position[row]))]
         score = None if table.score is None else table.score[row]
@@ -205,13 +202,11 @@ class EvaluationSet:
 
     def of_boxes(self, gt: Rows, pred: Rows, frame: np.ndarray) -> EvaluationSet:
         """Returns the evaluation set of rows of `gt` and `pred` in the frames of these ids."""
+        is_simulated = np.full(frame.size, self.is_simulated)
         return EvaluationSet(
             *self.evaluated(gt, pred),
             classes=self.classes,
-            frames={
-                "frame": frame,
-                "simulated": np.full(frame.size, self.is_simulated),
-            },
+            frames={"frame": frame, "simulated": is_simulated},
             roi=self._roi,
             label_version=self.label_version,
         )
@@ -246,10 +241,8 @@ class EvaluationSet:
             volume = area * shared_height(a, b, z_center)
             area_a, area_b = a[:, 3] * a[:, 4], b[:, 3] * b[:, 4]
             volumes = area_a * a[:, 5] + area_b * b[:, 5]
-            values[:, rows] = (
-                area / (area_a + area_b - area),
-                volume / (volumes - volume),
-            )
+            values[0, rows] = area / (area_a + area_b - area)
+            values[1, rows] = volume / (volumes - volume)
         if geometry == "plain":
             return values
         # K-Radar's code stores IoUs in single precision and compares them in double.
@@ -272,9 +265,8 @@ class EvaluationSet:
             return matching.match_kradar(pairs, self.score, self.gt_group, iou)
         if rule == "best":
             return matching.match_best(pairs, self.score, iou)
-        return matching.match_free(
-            pairs, self.score, self.pred_group, len(self.gt), iou
-        )
+        num_gt = len(self.gt)
+        return matching.match_free(pairs, self.score, self.pred_group, num_gt, iou)
 
     @functools.cached_property
     def by_score(self) -> list[Int[np.ndarray, " _"]]:
@@ -328,26 +320,22 @@ class EvaluationSet:
         dropped = dict.fromkeys(points, np.zeros(0))
         num_frames = (frame_weights > 0).sum(axis=0).tolist()
         score_threshold, results = float(score_threshold), []
-        for space, iou, (index, name) in itertools.product(
-            spaces, ious, enumerate(self.classes)
-        ):
+        cases = itertools.product(spaces, ious, enumerate(self.classes))
+        for space, iou, (index, name) in cases:
             # Protocols with the same geometry and matching share their rankings.
             matched_by = chosen.geometry, chosen.matching, space, iou
             ranked = self._once(self._ranking, matched_by, score_threshold, index)
             weight = frame_weights[:, index]
             num_gt = int(weight @ self.gt_count[:, index])
+            terms = num_gt, chosen.curve
             if chosen.matching == "kradar":
                 matched, events, detections = (
                     (score, count * weight[frame]) for score, frame, count in ranked
                 )
-                curve = protocols.kradar_curve(
-                    matched, events, detections, num_gt, chosen.curve
-                )
+                curve = protocols.kradar_curve(matched, events, detections, *terms)
             else:
                 ((score, frame, is_tp),) = ranked
-                curve = protocols.pooled_curve(
-                    score, is_tp, weight[frame], num_gt, chosen.curve
-                )
+                curve = protocols.pooled_curve(score, is_tp, weight[frame], *terms)
             result = Result(
                 cls=name,
                 space=space,

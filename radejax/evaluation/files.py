@@ -66,9 +66,8 @@ def read_table(
             columns = {**columns, "frame": names[columns["frame"]]}
     elif path.is_dir() or path.suffix == ".json":
         parts = sorted(path.glob("*.json")) if path.is_dir() else [path]
-        columns = boxes.columns_of(
-            [row for part in parts for row in _records(part, scored)]
-        )
+        rows = [row for part in parts for row in _records(part, scored)]
+        columns = boxes.columns_of(rows)
     elif path.suffix == ".npz":
         columns = read_npz(path)
         if missing := [name for name in wanted if name not in columns]:
@@ -194,10 +193,8 @@ def load(
                 f"{', '.join(np.unique(values))}"
             )
         frames = boxes.take(frames, is_chosen)
-        truth, found = (
-            boxes.take(table, np.isin(table["frame"], frames["frame"]))
-            for table in (truth, found)
-        )
+        truth = boxes.take(truth, np.isin(truth["frame"], frames["frame"]))
+        found = boxes.take(found, np.isin(found["frame"], frames["frame"]))
     return truth, found, frames, left_out
 
 
@@ -213,12 +210,11 @@ def _load_ground_truth(
         frames = _read_frames(table) if table.is_file() else None
         return read_table(truth, frames, scored=False), frames, {}
     if source.data or source.labels:
+        roots = list(source.data) or None
+        version = source.label_version
+        split = None if source.split == "all" else source.split
         data = KRadar(
-            list(source.data) or None,
-            source.labels,
-            version=source.label_version,
-            split=None if source.split == "all" else source.split,
-            classes=classes,
+            roots, source.labels, version=version, split=split, classes=classes
         )
         counts = {f"labels: {what}": int(n) for what, n in data.counts.items()}
         return *boxes.tables_from_frames(data, source.split), counts

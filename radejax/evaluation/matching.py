@@ -211,11 +211,9 @@ def match_kradar(
     best = alone.pred[_is_new(alone.gt)]
     rivals = pairs.take(has_rival[pairs.gt])
     step_pred, step_delta = _steps(rivals, score, gt_group[rivals.gt])
-    return KradarMatches(
-        pairs.pred[chosen],
-        np.concatenate([best, step_pred]),
-        np.concatenate([np.ones(best.size, np.int64), step_delta]),
-    )
+    event_pred = np.concatenate([best, step_pred])
+    event_delta = np.concatenate([np.ones(best.size, np.int64), step_delta])
+    return KradarMatches(pairs.pred[chosen], event_pred, event_delta)
 
 
 def _steps(

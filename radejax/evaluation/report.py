@@ -99,6 +99,7 @@ def write_report(
     iou = options.iou_thresholds[0]
     settings = f"3d, IoU {iou:g}, score>{options.min_score:g}; precision and recall "
     settings += f"at score>{analysis.OPERATING_SCORE:g}"
+    subsets = {"protocol": f"{protocols.RECOMMENDED}, {settings}"}
     # The split is that of all frames, or None if it is unknown or differs.
     splits = np.unique(np.asarray(frames.get("split", [])).astype(str))
     metrics = {
@@ -115,10 +116,7 @@ def write_report(
         if any(result.has_interval for result in results)
         else "none: they need --bootstrap and frames of two sequences or more",
         "ap": [to_row(result) for result in results],
-        "subsets": {
-            "protocol": f"{protocols.RECOMMENDED}, {settings}",
-            **analysis.subsets(data, frames, iou),
-        },
+        "subsets": subsets | analysis.subsets(data, frames, iou),
         "box_errors": analysis.box_errors(data, iou),
         "worst_frames": analysis.worst_frames(data, frames, iou),
     }
@@ -334,11 +332,8 @@ def class_by_weather(
             for name in conditions
         )
         body.append([cls, *(" / ".join(numbers(pair)) for pair in pairs)])
-    return Table(
-        f"AP 3D / BEV at IoU {iou:g}, {terms_of(results, protocol)}",
-        ["Class", *(TITLES.get(name, name) for name in conditions)],
-        body,
-    )
+    title = f"AP 3D / BEV at IoU {iou:g}, {terms_of(results, protocol)}"
+    return Table(title, ["Class", *(TITLES.get(x, x) for x in conditions)], body)
 
 
 def by_protocol(
@@ -383,12 +378,9 @@ def error_table(errors: Mapping[str, Mapping[str, float]]) -> Table:
     """Builds the table of median errors of matched boxes and of reversed headings."""
     entries = [{"cls": cls, **found} for cls, found in errors.items()]
     medians = [name for name in entries[0] if name.endswith("_median")]
-    return _table_of(
-        "Median errors of matched boxes (all scores); reversed: heading off by more"
-        " than 90 deg",
-        entries,
-        ["cls", "count", *medians, "reversed"],
-    )
+    title = "Median errors of matched boxes (all scores); reversed: heading off by more"
+    title += " than 90 deg"
+    return _table_of(title, entries, ["cls", "count", *medians, "reversed"])
 
 
 def _table_of(
@@ -467,9 +459,8 @@ class PublishedRow:
             f"labels={self.label_version}{origin}",
             f"roi={self.region}",
         )
-        return ", ".join(
-            term for term in terms if not re.search("[>=]not stated", term)
-        )
+        known = [term for term in terms if not re.search("[>=]not stated", term)]
+        return ", ".join(known)
 
     def differences(
         self,
@@ -540,6 +531,7 @@ def paper_tables(
         return []
     classes = [{"cls": cls} for cls in (*options.classes, "mean")]
     conditions = [{"condition": name} for name in CONDITIONS]
+    sedan = [{"cls": "Sedan"}]
     ious = _crossed([{"iou": 0.3}, {"iou": 0.5}], _BOTH)
     common = [group for group in classes if group["cls"] in _OF_OTHERS]
     elsewhere = [row.source for row in PUBLISHED if ", Table" not in row.source]
@@ -562,12 +554,7 @@ def paper_tables(
             [{"condition": "all"}],
             _crossed(classes, _BOTH),
         ),
-        (
-            "Ablations, Sedan (layout of Table III)",
-            _ABLATIONS,
-            [{"cls": "Sedan"}],
-            ious,
-        ),
+        ("Ablations, Sedan (layout of Table III)", _ABLATIONS, sedan, ious),
         ("Other methods, all weathers, as printed elsewhere", elsewhere, common, ious),
     ]
     if "Sedan" not in options.classes:

@@ -225,9 +225,7 @@ def compute_results(
     sequence = np.asarray(frames["sequence"]) if is_resampled else None
     everything = {"all": np.ones(data.frame.size, bool)}
     for condition, mask in (everything | condition_masks(frames, "weather")).items():
-        has_interval = (
-            options.protocols if condition == "all" else options.main_protocols
-        )
+        resampled = options.protocols if condition == "all" else options.main_protocols
         part, weights = data, None
         if sequence is not None and np.unique(sequence[mask]).size > 1:
             part = data if mask.all() else data.of_frames(mask)
@@ -246,7 +244,7 @@ def compute_results(
             for start in range(0, len(results), len(data.classes)):
                 group = results[start : start + len(data.classes)]
                 group.append(_mean(group))
-                if weights is not None and protocol in has_interval:
+                if weights is not None and protocol in resampled:
                     metric = protocol, group[0].space, group[0].iou
                     samples = resample(part, weights, *metric, **settings)
                     samples[:, is_single] = np.nan
