@@ -117,17 +117,14 @@ def front_images(
         UserError: The labels are of another version, there are images and no calibration,
             or a calibration is for images of another size than the model's.
     """
-    others = {
-        files.as_path(root).absolute() for root in roots if files.as_path(root).is_dir()
-    }
+    searched = map(files.as_path, roots)
+    others = {path.absolute() for path in searched if path.is_dir()}
     others = {root for root in others if any(map(sequence_number, root.iterdir()))}
-    others -= {sequence_folder(path).parent for path in paths}
-    sequences = [
-        folder
-        for folder in {sequence_folder(path) for path in paths}
-        if sequence_number(folder) is not None
-        and (labels or others or any(folder.glob("info_label*")))
-    ]
+    folders = {sequence_folder(path) for path in paths}
+    others -= {folder.parent for folder in folders}
+    sequences = {f for f in folders if sequence_number(f) is not None}
+    if not (labels or others):
+        sequences = {f for f in sequences if any(f.glob("info_label*"))}
     if not sequences:
         return {}
     frames = KRadar(

@@ -115,7 +115,8 @@ def export(
     expected = "projection, as config.data.num_frames of the model is above 1"
     is_possible = detector.num_frames == 1 or not is_tensor
     require(is_possible, "input", radar_input, expected)
-    release = detector.saved.config.data.get("release")
+    saved = detector.saved
+    release = saved.config.data.get("release")
     expected = f"projection, as the model is for {release} files"
     require(not (release and is_tensor), "input", radar_input, expected)
     *bins, channels = grid.projection_shape
@@ -126,11 +127,7 @@ def export(
     elif kind == "onnx":
         programs = _onnx_files(detector, shape, batch_size or 1, with_backbone)
     content = save_model(
-        detector.saved,
-        folder,
-        with_backbone=with_backbone,
-        half=half,
-        programs=programs,
+        saved, folder, with_backbone=with_backbone, half=half, programs=programs
     )
     for name in set(_OF_PROGRAMS) - set(programs):
         (folder / name).unlink(missing_ok=True)
@@ -138,10 +135,8 @@ def export(
         files.write_text(folder / "load.py", inspect.getsource(exported_loader))
     left_out = content["left_out"]
     files.write_text(folder / "README.md", _readme(detector, shape, left_out))
-    return {
-        "bytes": sum(p.stat().st_size for p in folder.rglob("*") if p.is_file()),
-        "left_out": left_out,
-    }
+    num_bytes = sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
+    return {"bytes": num_bytes, "left_out": left_out}
 
 
 def _readme(detector: Detector, shape: Sequence[int], left_out: Sequence[str]) -> str:
@@ -184,10 +179,11 @@ def _exported(
     if not detector.takes_camera:
         return variables, (radar,)
     model = detector.model
-    image, camera = jax.tree.map(
-        lambda x: _array(batch, *x.shape[1:], dtype=x.dtype),
-        no_images(1, model.image_size),
-    )
+
+    def of_batch(x: Any) -> jax.ShapeDtypeStruct:
+        return _array(batch, *x.shape[1:], dtype=x.dtype)
+
+    image, camera = jax.tree.map(of_batch, no_images(1, model.image_size))
     if not (with_backbone or model.vit is None):
         variables["params"].pop(IMAGE_BACKBONE, None)
         image = _array(batch, *model.feature_shape)
@@ -273,9 +269,8 @@ def _stablehlo(
 
     weights = {name: _array(*x.shape) for name, x in flat.items()}
     settings = [_array(*shape) for shape in SETTINGS.values()]
-    exported = jax.export.export(jax.jit(program), platforms=tuple(platforms))(
-        weights, inputs, *settings
-    )
+    export_of = jax.export.export(jax.jit(program), platforms=tuple(platforms))
+    exported = export_of(weights, inputs, *settings)
     names = [*sorted(weights), *_names(inputs), *SETTINGS]
     kept = exported.module_kept_var_idx  # a program has only the inputs that it uses
     used = [(names[i], exported.in_avals[i]) for i in kept]

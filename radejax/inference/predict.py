@@ -100,10 +100,8 @@ def predict_dataset(
             is_real = columns["frame"] >= 0
             parts.append({name: column[is_real] for name, column in columns.items()})
             bar.update(int((frame >= 0).sum()))
-    return {
-        name: np.concatenate([part[name] for part in parts])
-        for name in ("frame", "box", "cls", "score")
-    }
+    names = ("frame", "box", "cls", "score")
+    return {name: np.concatenate([part[name] for part in parts]) for name in names}
 
 
 def embed_dataset(
@@ -144,21 +142,17 @@ def embed_dataset(
     if not len(frames):
         raise UserError("no frames to embed")
     params = variables["params"][IMAGE_BACKBONE]
-    source = {
-        "image": embedding_fields(image_config),
-        "weights_sha256": weights_sha256(params),
-    }
+    fields = embedding_fields(image_config)
+    source = {"image": fields, "weights_sha256": weights_sha256(params)}
     records = Records.create(folder, model.feature_shape, dtype, source, "float32")
     keys = records.keys()
     images = [f for f in frames if f.camera_path is not None and f.key not in keys]
     found = sum(frame.key in keys for frame in frames)
 
     def read(frame: Any) -> UInt8[np.ndarray, "H W 3"]:
+        size = frame.calibrated_size()
         return read_left_image(
-            frame.camera_path,
-            model.image_size,
-            resize=resize,
-            calibrated_size=frame.calibrated_size(),
+            frame.camera_path, model.image_size, resize=resize, calibrated_size=size
         )
 
     embed = jax.jit(lambda params, image: model.apply(params, image, method="embed"))
@@ -172,9 +166,8 @@ def embed_dataset(
     with tqdm.tqdm(total=len(images), desc="embed") as bar:
         for i, batch in enumerate(batches):
             empty = [(0, batch_size - len(batch)), (0, 0), (0, 0), (0, 0)]
-            features = np.asarray(embed(params, np.pad(batch, empty))).astype(
-                records.dtype
-            )
+            features = np.asarray(embed(params, np.pad(batch, empty)))
+            features = features.astype(records.dtype)
             for row, frame in enumerate(images[i * batch_size :][: len(batch)]):
                 records.write(frame.key, features[row])
             bar.update(len(batch))

@@ -196,14 +196,11 @@ def save_model(
             )
         params.pop(IMAGE_BACKBONE, None)
     is_incomplete = is_vit and IMAGE_BACKBONE not in params
-    arrays = {
-        name: np.ascontiguousarray(value, np.float16 if half else None)
-        for name, value in traverse_util.flatten_dict(variables, sep="/").items()
-    }
-    contents = {
-        WEIGHTS_FILE: safetensors.numpy.save(arrays, {"format": "jax"}),
-        **(programs or {}),
-    }
+    flat = traverse_util.flatten_dict(variables, sep="/")
+    dtype = np.float16 if half else None
+    arrays = {name: np.ascontiguousarray(x, dtype) for name, x in flat.items()}
+    weights = safetensors.numpy.save(arrays, {"format": "jax"})
+    contents = {WEIGHTS_FILE: weights, **(programs or {})}
     for name, data in contents.items():
         with files.atomic_write(folder / name) as file:
             file.write(data)
