@@ -28,6 +28,7 @@ from radejax.data.kradar.conditions import WEATHERS
 from radejax.data.kradar.labels import LABEL_CLASSES, VERSIONS, VISIBILITY_FLAGS
 from radejax.data.reduced import RELEASES
 from radejax.detection.decode import DecodeOptions
+from radejax.evaluation.evaluation_set import SPACES
 from radejax.evaluation.results import EvaluationOptions
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.detection import LossOptions
@@ -136,11 +137,8 @@ def _check_pairs(config: ConfigDict) -> None:
     text = f"at most config.train.learning_rate, {peak}"
     require(final <= peak, "config.train.final_learning_rate", final, text)
     if config.train.evaluate_every_epochs:
-        known = [
-            f"map_{space}_iou{100 * iou:.4g}"
-            for space in ("bev", "3d")
-            for iou in config.evaluation.iou_thresholds
-        ]
+        ious = config.evaluation.iou_thresholds
+        known = [f"map_{space}_iou{100 * iou:.4g}" for space in SPACES for iou in ious]
         best = config.train.best_metric
         require(best in known, "config.train.best_metric", best, f"one of {known}")
 

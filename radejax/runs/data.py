@@ -79,9 +79,8 @@ class Data:
                     "(config.model.image.freeze=True) and, as they cannot be mirrored, "
                     "config.data.mirror_probability=0"
                 )
-            self.features = records.open_embeddings(
-                options.embeddings, config.model.image
-            )
+            image_config = config.model.image
+            self.features = records.open_embeddings(options.embeddings, image_config)
         is_common = self.camera is not None and self.camera.calibration == "common"
         self.frames = data_set(options.format)(
             options.roots,
@@ -234,11 +233,8 @@ class Data:
             boxes, classes = table.boxes[order], table.classes[order]
             table = dataclasses.replace(table, boxes=boxes, classes=classes)
         augment = Augmentation(self.records.grid, options.mirror_probability)
-        loader = pipeline.LoaderOptions(
-            train.batch_size // jax.process_count(),
-            seed,
-            num_threads=options.num_threads,
-        )
+        size = train.batch_size // jax.process_count()
+        loader = pipeline.LoaderOptions(size, seed, num_threads=options.num_threads)
         return pipeline.make_loader(table, loader, augment=augment)
 
 

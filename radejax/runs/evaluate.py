@@ -69,7 +69,7 @@ class Evaluation:
         **changes: Any,
     ) -> None:
         self._config, self._data, self._split = config, data, split
-        self._options = EvaluationOptions.from_config(config, **changes)
+        options = self._options = EvaluationOptions.from_config(config, **changes)
         self._source = source_of(data, split, shuffle_images)
         self._frames = data.split(split)
         self._seen: FrameSequence = self._frames
@@ -77,11 +77,9 @@ class Evaluation:
             self._seen = with_shuffled_images(data, split, shuffle_images)
         self._images = data.images(self._seen)
         self._truth, self._table = tables_from_frames(self._frames, split)
-        self._detector = Detector(
-            SavedModel(config, data.records.grid, {}),
-            distributed.batch_sharding(distributed.make_mesh()),
-            score_threshold=self._options.min_score,
-        )
+        saved = SavedModel(config, data.records.grid, {})
+        placement = distributed.batch_sharding(distributed.make_mesh())
+        self._detector = Detector(saved, placement, score_threshold=options.min_score)
 
     def predict(
         self, variables: Mapping[str, Any], **options: Any

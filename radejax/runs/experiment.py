@@ -103,15 +103,14 @@ def run(
         validate = None
         if config.train.evaluate_every_epochs:
             validate = Evaluation(config, data, data.choosing_split).validate
+        same = _invariants(frames, frozen_sha256)
         state, is_finished = loop.train(
             config,
             model,
             loader,
             models.map_grid(grid, model, config.data.azimuth_mapping),
             folder,
-            info=checkpoint_info(
-                config, grid, info, _invariants(frames, frozen_sha256)
-            ),
+            info=checkpoint_info(config, grid, info, same),
             steps_per_epoch=len(frames) // config.train.batch_size,
             variables=variables,
             pretrained=pretrained,
@@ -155,6 +154,7 @@ def claimed(workdir: pathlib.Path, config: ConfigDict) -> Iterator[None]:
             another configuration, in which case the message names the fields that differ.
     """
     path = workdir / "config.json"
+    content = without_data_paths(config)
     message = (
         f"another training is at work in {files.relative(workdir)}: wait for its end, or "
         "give another --workdir"
@@ -164,17 +164,12 @@ def claimed(workdir: pathlib.Path, config: ConfigDict) -> Iterator[None]:
         def take() -> None:
             held.enter_context(files.lock(workdir / "lock", message))
             if not any(workdir.glob("checkpoints/*")):
-                files.write_json(path, without_data_paths(config))
+                files.write_json(path, content)
 
         distributed.main_only(take)
-        files.claim(
-            path,
-            without_data_paths(config),
-            "a run with another config",
-            fix="give another --workdir, or remove that one",
-            name="config",
-            ignore=("logging",),
-        )
+        what = "a run with another config"
+        fix = "give another --workdir, or remove that one"
+        files.claim(path, content, what, fix=fix, name="config", ignore=("logging",))
         yield
 
 
@@ -226,10 +221,8 @@ def _invariants(frames: FrameSequence, frozen_sha256: str | None) -> dict[str, A
     backbone by its weights.
     """
     keys = "\n".join(frame.key for frame in frames)
-    values = {
-        "frames to train on": len(frames),
-        "sha256 of their keys": hashlib.sha256(keys.encode()).hexdigest()[:16],
-    }
+    digest = hashlib.sha256(keys.encode()).hexdigest()[:16]
+    values = {"frames to train on": len(frames), "sha256 of their keys": digest}
     if frozen_sha256 is not None:
         values[FROZEN_BACKBONE] = frozen_sha256[:16]
     return values

@@ -114,10 +114,8 @@ def average_shares(
         chosen = stacked if name == "all" else stacked[names == name]
         is_seen = chosen > 0
         mean = mean_share(chosen.sum(0) / np.maximum(is_seen.sum(0), 1), grid)
-        means[name] = {
-            "mean": None if np.isnan(mean) else mean,
-            "frames": int(is_seen.any((1, 2)).sum()),
-        }
+        count = int(is_seen.any((1, 2)).sum())
+        means[name] = {"mean": None if np.isnan(mean) else mean, "frames": count}
     return means
 
 
