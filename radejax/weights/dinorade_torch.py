@@ -106,10 +106,8 @@ def _transformer(
 def infer_fusion(tensors: StateDict, overrides: Mapping[str, Any]) -> dict[str, Any]:
     """Infer fields of `config.model.fusion` from names and shapes, and apply the overrides."""
     has_weights = any(n.startswith("fusion.weighting_network.") for n in tensors)
-    fields = {
-        "weighting": "cnn" if has_weights else "off",
-        "necks": any(n.startswith("fusion.rad_neck.") for n in tensors),
-    }
+    has_necks = any(n.startswith("fusion.rad_neck.") for n in tensors)
+    fields = {"weighting": "cnn" if has_weights else "off", "necks": has_necks}
     samples = tensors.get("fusion.deform_attn.attention_weights.bias")
     if samples is not None:
         heads = max(overrides.get("num_heads", 4), 1)
@@ -166,11 +164,8 @@ def without_lora(tensors: StateDict) -> dict[str, Any]:
     Raises:
         DataError: An adapter has no matrix A, B or W, or their shapes do not match.
     """
-    merged = {
-        name.replace(".base_layer.", "."): value
-        for name, value in tensors.items()
-        if ".lora_" not in name
-    }
+    own = {k: v for k, v in tensors.items() if ".lora_" not in k}
+    merged = {k.replace(".base_layer.", "."): v for k, v in own.items()}
     for module in {n.partition(".lora_")[0] for n in tensors if ".lora_" in n}:
         weight = f"{module}.weight"
         halves = [f"{module}.lora_{half}.default.weight" for half in "BA"]

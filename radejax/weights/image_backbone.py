@@ -160,11 +160,8 @@ def load_resnet(
     tensors, source = convert.read_state_dict(state_dict_or_path, "layer1.0.")
     has_last = any(name.startswith("layer4.") for name in tensors)
     parts = r"image_backbone/|image_neck/block_" if has_last else r"image_backbone/"
-    shapes = {
-        path: shape
-        for path, shape in convert.variable_shapes(model).items()
-        if re.match(rf"\w+/({parts})", path)
-    }
+    shapes = convert.variable_shapes(model)
+    shapes = {k: s for k, s in shapes.items() if re.match(rf"\w+/({parts})", k)}
     return convert.from_torch(RESNET_RULES, shapes, tensors, source, r"fc\.")
 
 

@@ -141,13 +141,13 @@ def infer_config(
     if fields["input_stem"]:
         fields["doppler_bins"] = size(f"{stem}.doppler_conv.0.weight", 1)
         fields["elevation_bins"] = size(f"{stem}.elevation_conv.0.weight", 1)
-    elif not {"doppler_bins", "elevation_bins"} <= set(overrides) and (
-        (channels := size(f"{backbone}.start_conv.weight", 1)) != 101
-    ):
-        raise UserError(
-            f"{source}: the model reads {channels} channels and nothing shows how many "
-            "are Doppler; give doppler_bins and elevation_bins"
-        )
+    elif not {"doppler_bins", "elevation_bins"} <= set(overrides):
+        channels = size(f"{backbone}.start_conv.weight", 1)
+        if channels != 101:
+            raise UserError(
+                f"{source}: the model reads {channels} channels and nothing shows how "
+                "many are Doppler; give doppler_bins and elevation_bins"
+            )
     fields |= overrides
     fields["cbam"] = fields["cbam"] or "off"
     return fields
@@ -204,10 +204,9 @@ def neck_rules(ours: str, theirs: str) -> Rules:
 def torch_shapes(model: RadeNet) -> dict[str, tuple[int, ...]]:
     """Return the shapes of the official tensors that a model uses, by official name."""
     names = rules(model.heads)
-    return {
+    shapes = {}
+    for path, shape in convert.variable_shapes(model).items():
         # A broadcast scalar has the shape without using the memory.
-        convert.torch_name(names, path): convert.to_torch_layout(
-            path, np.broadcast_to(0, shape)
-        ).shape
-        for path, shape in convert.variable_shapes(model).items()
-    }
+        value = convert.to_torch_layout(path, np.broadcast_to(0, shape))
+        shapes[convert.torch_name(names, path)] = value.shape
+    return shapes
