@@ -127,15 +127,11 @@ class Checkpoints:
             "checksums": array_checksums(state),
         }
         description["sha256"] = _text_checksum(description)
+        text = ocp.args.JsonSave(description)
+        args = ocp.args.Composite(state=ocp.args.PyTreeSave(state), description=text)
+        metrics = None if best is None else {_BEST: best}
         with files.disk_full(self.folder):
-            self._manager.save(
-                step,
-                args=ocp.args.Composite(
-                    state=ocp.args.PyTreeSave(state),
-                    description=ocp.args.JsonSave(description),
-                ),
-                metrics=None if best is None else {_BEST: best},
-            )
+            self._manager.save(step, args=args, metrics=metrics)
 
     def wait(self) -> None:
         """Waits until all started checkpoints are on disk.
@@ -230,15 +226,12 @@ class Checkpoints:
                 restore_args = jax.tree.map(lambda _: numpy, state)
             else:
                 restore_args = ocp.checkpoint_utils.construct_restore_args(state)
-            found = self._manager.restore(
-                step,
-                args=ocp.args.Composite(
-                    state=ocp.args.PyTreeRestore(
-                        state, restore_args=restore_args, partial_restore=True
-                    ),
-                    description=ocp.args.JsonRestore(),
-                ),
+            arrays = ocp.args.PyTreeRestore(
+                state, restore_args=restore_args, partial_restore=True
             )
+            text = ocp.args.JsonRestore()
+            args = ocp.args.Composite(state=arrays, description=text)
+            found = self._manager.restore(step, args=args)
             description = found["description"]
             if description.pop("sha256") != _text_checksum(description):
                 raise DataError("the checksum of its description differs")

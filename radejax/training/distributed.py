@@ -137,11 +137,9 @@ def main_only(work: Callable[[], T]) -> T | None:
         error = failed
     # With an explicit list of processes, they wait at the coordinator and not in a
     # collective, which would time out after minutes.
-    ocp.multihost.sync_global_processes(
-        f"radejax {next(_numbers)}",
-        timeout=_WAIT_S,
-        processes=set(range(jax.process_count())),
-    )
+    name = f"radejax {next(_numbers)}"
+    processes = set(range(jax.process_count()))
+    ocp.multihost.sync_global_processes(name, timeout=_WAIT_S, processes=processes)
     is_fine = all_agree(error is None)
     if error is not None:
         raise error

@@ -110,18 +110,15 @@ def train(
     given = jax.tree.map(np.asarray, (_empty_batch(loader), variables, pretrained))
     initial = functools.partial(_initial_variables, model, config.seed, *given)
     mesh = distributed.make_mesh()
-    with Checkpoints(
-        folder / "checkpoints", max_to_keep=options.checkpoints_to_keep
-    ) as checkpoints:
+    kept = options.checkpoints_to_keep
+    with Checkpoints(folder / "checkpoints", max_to_keep=kept) as checkpoints:
         state = _restore_or_initialize(
             checkpoints, loader, info, initial, create, mesh, options.parameter_sharding
         )
         train_step = _compile(step_fn, state, mesh, config.seed)
         num_steps = count_steps(options, steps_per_epoch)
-        with (
-            MetricLogger(folder, config, int(state.step), num_steps) as logger,
-            distributed.stop_on_signal(mesh) as stop,
-        ):
+        logger = MetricLogger(folder, config, int(state.step), num_steps)
+        with logger, distributed.stop_on_signal(mesh) as stop:
             run = _Run(
                 *(config, steps_per_epoch, num_steps, loader, info, evaluate),
                 *(checkpoints, logger, stop, schedule),

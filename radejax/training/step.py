@@ -265,9 +265,8 @@ def make_train_step(
     ) -> tuple[TrainState, Metrics]:
         chex.assert_tree_shape_prefix(batch, batch.frame.shape)
         rng = jax.random.fold_in(rng, state.step)
-        (total, (model_state, parts)), grads = jax.value_and_grad(
-            loss_fn, has_aux=True
-        )(state.params, state, batch, rng)
+        grad_fn = jax.value_and_grad(loss_fn, has_aux=True)
+        (total, (model_state, parts)), grads = grad_fn(state.params, state, batch, rng)
         grad_norm = optax.global_norm(grads)
         is_finite = jnp.isfinite(grad_norm) & jnp.isfinite(total)
 
