@@ -27,9 +27,8 @@ class _Command(entry.Command):
         words = [word for word in args if not word.startswith(_PREFIX)]
         fields = [word.removeprefix(_PREFIX) for word in args if word not in words]
         pairs = (field.partition("=") for field in fields)
-        ctx.meta["fields"] = {
-            n: text if is_set else "true" for n, is_set, text in pairs
-        }
+        values = {name: text if is_set else "true" for name, is_set, text in pairs}
+        ctx.meta["fields"] = values
         return super().parse_args(ctx, words)
 
 
