@@ -140,6 +140,5 @@ def check_options(values: Any, section: str, ranges: Mapping[str, Range]) -> Non
 
 
 def _is_number(value: Any, least: float, most: float = math.inf) -> bool:
-    return (
-        not isinstance(value, bool) and math.isfinite(value) and least <= value <= most
-    )
+    is_finite = not isinstance(value, bool) and math.isfinite(value)
+    return is_finite and least <= value <= most

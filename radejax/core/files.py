@@ -307,13 +307,11 @@ def differences(found: Any, wanted: Any, name: str = "config") -> list[str]:
     if found == wanted:
         return []
     if isinstance(found, Mapping) and isinstance(wanted, Mapping):
-        return [
-            line
-            for key in sorted(set(found) | set(wanted))
-            for line in differences(
-                found.get(key), wanted.get(key), f"{name}.{key}".removeprefix(".")
-            )
-        ]
+        lines = []
+        for key in sorted(set(found) | set(wanted)):
+            field = f"{name}.{key}".removeprefix(".")
+            lines += differences(found.get(key), wanted.get(key), field)
+        return lines
     if max(len(repr(found)), len(repr(wanted))) > _MAX_VALUE_CHARS:
         return [f"{name} differs"]
     return [f"{name} is {found!r} there and {wanted!r} here"]

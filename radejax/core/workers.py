@@ -42,9 +42,8 @@ def process_pool(
     """
     others = multiprocessing.active_children()
     context = multiprocessing.get_context("spawn")
-    pool = concurrent.futures.ProcessPoolExecutor(
-        num_workers, context, _start, (start, *arguments)
-    )
+    given = (start, *arguments)
+    pool = concurrent.futures.ProcessPoolExecutor(num_workers, context, _start, given)
     try:
         with pool:
             _start_processes(pool, num_workers)
