@@ -333,8 +333,9 @@ class Detector:
         """
         if frames.dtype == jnp.uint8:
             return
-        extremes = (x[:count] for x in jax.device_get(self._extremes(frames)))
-        problems = map(functools.partial(_find_problem, frames.ndim - 1), *extremes)
+        lowest, beams = jax.device_get(self._extremes(frames))
+        find = functools.partial(_find_problem, frames.ndim - 1)
+        problems = map(find, lowest[:count].tolist(), beams[:count])
         found = list(filter(None, problems))
         if found and not self.num_invalid_frames:
             _log.warning(
@@ -581,14 +582,14 @@ def _extremes(
 
 
 def _find_problem(
-    num_axes: int, lowest: Real[np.ndarray, ""], beams: Real[np.ndarray, "_ _"]
+    num_axes: int, lowest: float, beams: Real[np.ndarray, "_ _"]
 ) -> str | None:
     """Describe why a frame of 3 axes (projection) or 4 is not valid; None if it is."""
     beams = beams.astype(np.float64)
     if num_axes == 3:
         return find_problem(beams, -1.0 if np.isneginf(lowest) else 0.0)
     with np.errstate(invalid="ignore"):  # the logarithm of a negative maximum
-        return find_problem(to_log_scale(beams), float(lowest))
+        return find_problem(to_log_scale(beams), lowest)
 
 
 def camera_batch(
