@@ -37,7 +37,7 @@ TRAINING = [("bfloat16", 8), ("tf32", 8), ("float32", 8)]
 COMPILED = {("bfloat16", 8), ("tf32", 8)}
 """Cases of RADE-Net's forward pass that are also measured with `torch.compile` on a GPU.
 
-Compiling DinoRADE and the training steps with it takes several minutes each.
+The others are measured without it, as compilation takes most of the time on a GPU.
 """
 
 

@@ -327,15 +327,18 @@ class EvaluationSet:
             ranked = self._once(self._ranking, matched_by, score_threshold, index)
             weight = frame_weights[:, index]
             num_gt = int(weight @ self.gt_count[:, index])
-            terms = num_gt, chosen.curve
             if chosen.matching == "kradar":
                 matched, events, detections = (
                     (score, count * weight[frame]) for score, frame, count in ranked
                 )
-                curve = protocols.kradar_curve(matched, events, detections, *terms)
+                curve = protocols.kradar_curve(
+                    matched, events, detections, num_gt, chosen.curve
+                )
             else:
                 ((score, frame, is_tp),) = ranked
-                curve = protocols.pooled_curve(score, is_tp, weight[frame], *terms)
+                curve = protocols.pooled_curve(
+                    score, is_tp, weight[frame], num_gt, chosen.curve
+                )
             result = Result(
                 cls=name,
                 space=space,

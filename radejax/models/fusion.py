@@ -7,7 +7,7 @@ References:
 
 from __future__ import annotations
 
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import flax.linen as nn
 import jax
@@ -129,8 +129,9 @@ class Fusion(Part):
         return dropout(share * seen + (1 - share) * radar)
 
     def _neck(self, name: str) -> DilatedNeck:
-        shared: dict[str, Any] = {"num_groups": self.num_groups, "dtype": self.dtype}
-        return DilatedNeck(**shared, remat=self.remat, name=name)
+        return DilatedNeck(
+            num_groups=self.num_groups, dtype=self.dtype, remat=self.remat, name=name
+        )
 
     def _camera_share(self, radar: Map, seen: Map) -> Float[jax.Array, "B R A #C"]:
         """Returns the weight of the camera per bin, for every channel or for all together."""

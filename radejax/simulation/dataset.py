@@ -172,9 +172,12 @@ class Writer:
         total = sum(len(self.source.frames(n)) for n in self.source.numbers)
         if num_workers is None:
             num_workers = (os.cpu_count() or 1) if len(missing) > _FEW_FRAMES else 0
-        of_radar = {"grid": self.grid, "parameters": self.parameters}
-        output = self.config.output
-        compute = functools.partial(tensor.simulate, **of_radar, output=output)
+        compute = functools.partial(
+            tensor.simulate,
+            grid=self.grid,
+            parameters=self.parameters,
+            output=self.config.output,
+        )
         with (
             tqdm(None, "simulate", total, unit="frame", disable=not progress) as bar,
             contextlib.closing(self._prepared(num_workers, missing)) as frames,
