@@ -44,6 +44,7 @@ def main(workdir, frame_id, box_z):
 
     rclpy.init()
     node = rclpy.create_node("radejax")
+    radejax.enable_compilation_cache()
     detector = radejax.Detector.from_workdir(workdir).warmup()
     boxes = node.create_publisher(Detection3DArray, "detections", 10)
     clouds = node.create_publisher(PointCloud2, "points", 10)

@@ -25,6 +25,7 @@ _LAZY = {
     "UserError": "core.errors",
     "data_of_run": "runs.data",
     "draw_frame": "visualize.draw",
+    "enable_compilation_cache": "core.compilation_cache",
     "evaluate": "evaluation",
     "frame_scene": "runs.figures",
     "front_view": "data.dataset",

@@ -20,7 +20,7 @@ from typing import Any
 
 import click
 
-from radejax.core import memory
+from radejax.core.compilation_cache import enable_compilation_cache
 from radejax.core.files import is_no_space
 
 FAILED = 1
@@ -93,7 +93,6 @@ def _message(error: BaseException) -> str:
 
 def set_up_jax() -> None:
     """Sets up logging at level info and JAX's persistent compilation cache."""
-    import jax
     from absl import flags
 
     log = logging.getLogger("radejax")
@@ -104,17 +103,14 @@ def set_up_jax() -> None:
         log.setLevel(logging.INFO)
         log.propagate = False
     flags.FLAGS.mark_as_parsed()  # grain's worker processes read an absl flag
-    memory.cache_compiled_programs()
-    # Small programs are cached too: compiling the fifty at the start of a run takes a
-    # second.
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    enable_compilation_cache()
 
 
 # Commands ----------------------------------------------------------------------------
 
 
 class Program(click.Command):
-    """A command that sets up huge pages before it runs as the main program."""
+    """A command with `-h` and the defaults of its options in the help."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -124,7 +120,6 @@ class Program(click.Command):
     def main(self, args: Any = None, *others: Any, **options: Any) -> Any:
         """Runs the command with the given arguments, by default those of this process."""
         if args is None:
-            memory.restart_with_huge_pages()
             sys.path.append(os.getcwd())  # for `config.data.format=module:Class`
         return super().main(args, *others, **options)
 

@@ -23,7 +23,6 @@ from jaxtyping import Bool, Float, Real, Shaped, UInt8
 from radejax import models
 from radejax.core.errors import UserError, require
 from radejax.core.files import PathLike, as_path
-from radejax.core.memory import cache_compiled_programs
 from radejax.core.structures import ROIS, Array, Batch, Detections, to_float
 from radejax.data.cameras import CameraOptions, no_camera, no_images, read_left_image
 from radejax.data.projection import (
@@ -165,7 +164,6 @@ class Detector:
         if isinstance(self.sharding, NamedSharding):
             self.replicated = NamedSharding(self.sharding.mesh, PartitionSpec())
         self._set_batch_sizes(batch_sizes)
-        cache_compiled_programs()
         self.variables = jax.device_put(saved.variables, self.replicated)
         self.num_radar_only = self.num_invalid_frames = 0
         self._lock = threading.Lock()
@@ -315,9 +313,12 @@ class Detector:
         count = inputs[0].shape[0]
         size = next(size for size in self._batch_sizes if size >= count)
         inputs = jax.tree.map(lambda x: self.put(_padded(x, size)), inputs)
-        if not is_checked:
-            self._count_invalid(inputs[0], count)
+        # The check is awaited after the network was started, so that the device is not idle
+        # meanwhile.
+        extremes = None if is_checked else self._extremes(inputs[0])
         found = self._run(self.variables, *inputs, settings)
+        if extremes is not None:
+            self._count_invalid(inputs[0], extremes, count)
         if jax.default_backend() == "cpu" and len(self.sharding.device_set) > 1:
             # With several batches in flight, CPU devices that share cores can fail to
             # synchronize.
@@ -325,7 +326,9 @@ class Detector:
         found = found.replace(class_names=self.classes)
         return found if count == size else jax.tree.map(lambda x: x[:count], found)
 
-    def _count_invalid(self, frames: Real[jax.Array, "B ..."], count: int) -> None:
+    def _count_invalid(
+        self, frames: Real[jax.Array, "B ..."], extremes: Any, count: int
+    ) -> None:
         """Count invalid frames among the first `count`, and warn of the first ones.
 
         Invalid are values that cannot be linear power or levels of a projection, see
@@ -333,7 +336,7 @@ class Detector:
         """
         if frames.dtype == jnp.uint8:
             return
-        lowest, beams = jax.device_get(self._extremes(frames))
+        lowest, beams = jax.device_get(extremes)
         find = functools.partial(_find_problem, frames.ndim - 1)
         problems = map(find, lowest[:count].tolist(), beams[:count])
         found = list(filter(None, problems))
@@ -355,7 +358,7 @@ class Detector:
         """Compute float32 projections of any radar data, and count invalid NumPy arrays."""
         placed = jnp.asarray(radar)
         if isinstance(radar, np.ndarray):
-            self._count_invalid(placed, len(placed))
+            self._count_invalid(placed, self._extremes(placed), len(placed))
         if placed.ndim == 5:
             placed = self.grid.measured_channels(project_jax(placed))
         return np.asarray(to_float(placed))

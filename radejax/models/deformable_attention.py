@@ -33,8 +33,10 @@ from radejax.models.layers import Layer
 Arrays = tuple[jax.Array, ...]
 Places = Float[jax.Array, "*places"]
 
-_CHUNK_SIZES = {"cpu": 448, "default": 8192}
-"""Bins per chunk.
+ChunkSizes = tuple[tuple[str, int], ...]  # platforms and bins, a hashable dictionary
+
+_CHUNK_SIZES = {"cpu": (448, 64), "default": (8192, 2048)}
+"""Bins per chunk of all samples together, and the least bins of each sample.
 
 On a CPU, the sampled rows should fit into the cache; an accelerator is faster with few
 large chunks.
@@ -186,29 +188,39 @@ def lifted_attention(
         `[B, N, heads, D]` attention of the bins.
     """
     b = value.shape[0]  # symbolic in exports
+    chunk_sizes = _chunk_sizes(chunk_size, b)
     value = jnp.moveaxis(value, 3, 1)  # [B, heads, H, W, D]
     by_head = jnp.moveaxis(offsets, 2, 1), jnp.moveaxis(logits, 2, 1)
+    # The geometry is either per sample or shared by the whole batch.
+    reference = jnp.broadcast_to(reference, (b, *reference.shape[1:]))
+    query_weights = jnp.broadcast_to(query_weights, (b, *query_weights.shape[1:]))
 
-    def sample(arrays: tuple[jax.Array, ...]) -> jax.Array:
-        value, offsets, logits, scale, *own = arrays
-        # The geometry is either per sample or shared by the whole batch.
-        geometry = own or (reference[0], query_weights[0])
-
+    # This is not a loop over the samples: if the batch is split over devices, a loop would
+    # gather all of it on each of them.
+    @jax.vmap
+    def sample(
+        value: jax.Array, offsets: jax.Array, logits: jax.Array, *shared: jax.Array
+    ) -> jax.Array:
         def head(arrays: tuple[jax.Array, ...]) -> jax.Array:
             value, offsets, logits, *biases = arrays
-            per_bin = (offsets, logits, scale, *geometry)
-            return _lifted_head(chunk_size, value, per_bin, tuple(biases))
+            per_bin = (offsets, logits, *shared)
+            return _lifted_head(chunk_sizes, value, per_bin, tuple(biases))
 
         return jax.lax.map(head, (value, offsets, logits, offset_bias, logit_bias))
 
-    arrays: tuple[jax.Array, ...] = (value, *by_head, scale)
-    if reference.shape[0] != 1 or query_weights.shape[0] != 1:
-        arrays += tuple(
-            jnp.broadcast_to(x, (b, *x.shape[1:])) for x in (reference, query_weights)
-        )
-    if b == 1:  # the compiler does not remove a loop of one step
-        return jnp.moveaxis(sample(tuple(x[0] for x in arrays)), 0, 1)[None]
-    return jnp.moveaxis(jax.lax.map(sample, arrays), 1, 2)
+    return jnp.moveaxis(sample(value, *by_head, scale, reference, query_weights), 1, 2)
+
+
+def _chunk_sizes(given: int, batch_size: Any) -> ChunkSizes:
+    """Returns the bins per chunk of each sample, by platform."""
+    if given:
+        return (("default", given),)
+    if not isinstance(batch_size, int):  # symbolic
+        batch_size = 1
+    return tuple(
+        (platform, max(least, bins // batch_size))
+        for platform, (bins, least) in _CHUNK_SIZES.items()
+    )
 
 
 # One sample, one head ----------------------------------------------------------------
@@ -217,32 +229,31 @@ def lifted_attention(
 # place. The automatic transpose of the loop would allocate and add a whole map per chunk.
 
 
-def _by_chunk(function: Callable[..., Any], chunk_size: int, *arrays: Any) -> Any:
-    """Calls `function(chunk_size, *arrays)`, where 0 stands for the platform's chunk size.
+def _by_chunk(
+    function: Callable[..., Any], chunk_sizes: ChunkSizes, *arrays: Any
+) -> Any:
+    """Calls `function(chunk_size, *arrays)` with the chunk size of the platform.
 
     The platform is that for which the program is lowered, which may differ from the tracing
     machine's. The forward and the backward pass call this separately, because the choice of
     the platform is not differentiated.
     """
-    if chunk_size:
-        return function(chunk_size, *arrays)
     by_platform = {
-        platform: functools.partial(function, size)
-        for platform, size in _CHUNK_SIZES.items()
+        platform: functools.partial(function, size) for platform, size in chunk_sizes
     }
     return jax.lax.platform_dependent(*arrays, **by_platform)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _lifted_head(
-    chunk_size: int, value: jax.Array, per_bin: Arrays, biases: Arrays
+    chunk_sizes: ChunkSizes, value: jax.Array, per_bin: Arrays, biases: Arrays
 ) -> jax.Array:
     """Computes the attention `[N, D]` of one head of one sample.
 
     `value` is `[H, W, D]`, `per_bin` contains offsets, logits, scale, reference and
     query weights, and `biases` the two biases, all as in `lifted_attention`.
     """
-    return _by_chunk(_head_forward, chunk_size, value, per_bin, biases)
+    return _by_chunk(_head_forward, chunk_sizes, value, per_bin, biases)
 
 
 def _head_forward(
@@ -263,12 +274,16 @@ def _head_forward(
     return out.reshape(-1, out.shape[-1])[: len(per_bin[0])]
 
 
-def _lifted_head_forward(chunk_size: int, *arrays: Any) -> tuple[jax.Array, Any]:
-    return _lifted_head(chunk_size, *arrays), arrays
+def _lifted_head_forward(
+    chunk_sizes: ChunkSizes, *arrays: Any
+) -> tuple[jax.Array, Any]:
+    return _lifted_head(chunk_sizes, *arrays), arrays
 
 
-def _lifted_head_backward(chunk_size: int, saved: Any, grad: jax.Array) -> tuple:
-    return _by_chunk(_head_backward, chunk_size, grad, *saved)
+def _lifted_head_backward(
+    chunk_sizes: ChunkSizes, saved: Any, grad: jax.Array
+) -> tuple:
+    return _by_chunk(_head_backward, chunk_sizes, grad, *saved)
 
 
 def _head_backward(

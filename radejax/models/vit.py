@@ -28,6 +28,7 @@ AttentionKind = Literal["auto", "blocked", "xla", "cudnn"]
 
 Tokens = Float[jax.Array, "B T C"]
 PerHead = Float[jax.Array, "B T heads D"]
+OfSample = Float[jax.Array, "T heads D"]
 Rope = tuple[Float[jax.Array, "patches D"], Float[jax.Array, "patches D"]]
 """Cosines and sines of the rotary embedding, with D channels per head."""
 
@@ -329,16 +330,14 @@ def attend(
     return plain(query, key, value, implementation=kind)
 
 
-def _attend_blocked(query: PerHead, key: PerHead, value: PerHead) -> PerHead:
-    b, t, heads, d = query.shape
+@jax.vmap  # a loop over samples would gather a batch that is split over devices
+def _attend_blocked(query: OfSample, key: OfSample, value: OfSample) -> OfSample:
+    t, heads, d = query.shape
     block = min(_BLOCK, t)
-    padding = ((0, 0), (0, -t % block), (0, 0), (0, 0))
-
-    def by_head(x: jax.Array) -> jax.Array:  # [B * heads, T, d]
-        return x.swapaxes(1, 2).reshape(b * heads, -1, d)
-
-    queries = by_head(jnp.pad(query * d**-0.5, padding))
-    queries = queries.reshape(b * heads, -1, block, d).swapaxes(2, 3)
+    queries = jnp.pad(query * d**-0.5, ((0, -t % block), (0, 0), (0, 0)))
+    queries = queries.swapaxes(0, 1).reshape(heads, -1, block, d).swapaxes(2, 3)
+    keys = key.swapaxes(0, 1)  # [heads, T, d]
+    values = value.transpose(1, 2, 0)  # [heads, d, T]
 
     def one_head(arrays: tuple[jax.Array, ...]) -> jax.Array:
         blocks, keys, values = arrays  # [n, d, block], [T, d], [d, T]
@@ -355,7 +354,5 @@ def _attend_blocked(query: PerHead, key: PerHead, value: PerHead) -> PerHead:
 
         return jax.lax.map(one_block, blocks)
 
-    arrays = queries, by_head(key), by_head(value).swapaxes(1, 2)
-    out = jax.lax.map(one_head, arrays)  # [B * heads, n, d, block]
-    out = out.swapaxes(2, 3).reshape(b, heads, -1, d)[:, :, :t]
-    return out.swapaxes(1, 2)
+    out = jax.lax.map(one_head, (queries, keys, values))  # [heads, n, d, block]
+    return out.swapaxes(2, 3).reshape(heads, -1, d)[:, :t].swapaxes(0, 1)

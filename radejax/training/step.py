@@ -257,7 +257,8 @@ def make_train_step(
             rngs={"dropout": rng},
             mutable=list(state.model_state),
         )
-        total, parts = detection_loss(maps, batch, grid, **loss)
+        with jax.named_scope("losses"):
+            total, parts = detection_loss(maps, batch, grid, **loss)
         return total, (model_state, parts)
 
     def step(
@@ -270,6 +271,7 @@ def make_train_step(
         grad_norm = optax.global_norm(grads)
         is_finite = jnp.isfinite(grad_norm) & jnp.isfinite(total)
 
+        @jax.named_scope("optimizer")
         def update() -> TrainState:
             updates, opt_state = optimizer.update(grads, state.opt_state, state.params)
             params = optax.apply_updates(state.params, updates)

@@ -2,6 +2,7 @@
 
 import json
 import pathlib
+import subprocess
 import sys
 from types import SimpleNamespace
 
@@ -11,8 +12,6 @@ import pytest
 
 from radejax.cli import main
 from radejax.cli.figures import MODEL
-from radejax.cli.train import train
-from radejax.core import memory
 from radejax.core.errors import UserError
 from radejax.data.kradar import write
 from radejax.data.kradar.labels import Label
@@ -243,15 +242,14 @@ def test_a_part_of_the_data_is_chosen(
     assert seen[-1] == (None, None)
 
 
-def test_a_program_asks_for_its_memory_and_a_call_does_not(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    asked = []
-    monkeypatch.setattr(memory, "restart_with_huge_pages", lambda: asked.append(1))
-    monkeypatch.setattr(sys, "argv", ["radejax", "--help"])
-    for program in (main.main, train):
-        program.main(["--help"], standalone_mode=False)
-        assert not asked
-        program.main(standalone_mode=False, prog_name="radejax")
-        assert asked == [1]
-        asked.clear()
+def test_a_program_does_not_replace_the_process_that_runs_it() -> None:
+    script = pathlib.Path(__file__).resolve().parents[2] / "train.py"
+    code = (
+        "import runpy, sys; print('started'); sys.argv = ['train.py', '--help']; "
+        f"runpy.run_path({str(script)!r}, run_name='__main__')"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.count("started") == 1
+    assert "--config" in done.stdout

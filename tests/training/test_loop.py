@@ -10,14 +10,17 @@ from typing import Any
 from unittest import mock
 
 import chex
+import flax.linen as nn
 import grain
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from ml_collections import ConfigDict
 
 from radejax.core.errors import DataError, UserError
+from radejax.core.structures import DetectionMaps
 from radejax.training import distributed, loop
 from radejax.training.checkpoints import Checkpoints
 from radejax.training.metric_logger import Scores
@@ -67,6 +70,7 @@ def run(tiny: Tiny) -> Any:
         loader: Any = None,
         config: Any = None,
         num_devices: int = 1,
+        model: Any = None,
         **others: Any,
     ) -> Any:
         options = {
@@ -79,7 +83,7 @@ def run(tiny: Tiny) -> Any:
             patch.setattr(distributed, "make_mesh", lambda: mesh)
             return loop.train(
                 tiny.config if config is None else config,
-                tiny.model,
+                tiny.model if model is None else model,
                 tiny.loader() if loader is None else loader,
                 tiny.map_grid,
                 workdir,
@@ -376,3 +380,35 @@ def test_a_trace_is_written(
     assert "no trace" not in caplog.text
     run(workdir, profile=str(workdir / "none"))
     assert "no trace: 0 steps are left" in caplog.text
+
+
+class _Logarithm(nn.Module):
+    """A product per bin, of levels whose logarithm is not finite."""
+
+    @nn.compact
+    def __call__(self, x: jax.Array, train: bool = False) -> DetectionMaps:
+        y = nn.Dense(5 + 8)(jnp.log(x - 2))
+        return DetectionMaps(y[..., :5], y[..., 5:])
+
+
+@pytest.mark.parametrize("setting", ["jax_debug_nans", "jax_disable_jit"])
+def test_debugging_works_in_a_run(
+    run: Any,
+    tiny: Tiny,
+    workdir: pathlib.Path,
+    setting: str,
+) -> None:
+    model = _Logarithm()
+    inputs = np.zeros((1, *tiny.grid.projection_shape))
+    variables = model.init(jax.random.key(0), inputs)
+    config = tiny.config.copy_and_resolve_references()
+    config.train.max_steps = 1
+    jax.config.update(setting, True)
+    try:
+        if setting == "jax_debug_nans":
+            with pytest.raises(FloatingPointError, match=r"\(nan\) encountered in log"):
+                run(workdir, config=config, model=model, variables=variables)
+        else:
+            run(workdir, config=config, model=model, variables=variables)
+    finally:
+        jax.config.update(setting, False)

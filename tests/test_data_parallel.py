@@ -1,0 +1,183 @@
+"""What devices exchange when they share a batch, for every kind of model.
+
+One step of training is compiled for 1, 2, 4 and 8 devices. Each device has to compute its own
+frames only, and to send no part of a frame to another.
+"""
+
+import functools
+import math
+import re
+from collections.abc import Callable
+from typing import Any
+
+import chex
+import jax
+import numpy as np
+import optax
+import pytest
+
+from radejax import models
+from radejax.core.structures import Batch
+from radejax.geometry.camera import stack_cameras
+from radejax.training import distributed
+from radejax.training.step import create_state, make_train_step
+
+from . import small_models
+
+BATCH_SIZE = 8
+COLLECTIVES = "all-reduce|all-gather|all-to-all|collective-permute|reduce-scatter"
+KINDS = {
+    "radenet": {"neck": "dilated", "heads": "expanded"},
+    "dinorade": {"image.freeze": True},
+    "dinorade_not_frozen": {"image.freeze": False},
+    "dinorade_resnet50": {"image.kind": "resnet50", "image.resnet_width": 4},
+}
+KEY = jax.random.key(7)
+
+
+@functools.cache
+def _case(kind: str) -> tuple[Any, Batch, Any, Callable[..., Any]]:
+    """Model, batch, state and step of one kind of model of small width."""
+    config = small_models.camera_config()
+    if kind == "radenet":
+        config = small_models.radar_config()
+    config.model.update_from_flattened_dict(KINDS[kind])
+    model = models.build(config.model)
+    batch = _batch(config)
+    inputs = jax.tree.map(lambda x: x[:1], batch).model_inputs()
+    variables = small_models.drawn(model, *inputs)
+    # Gradient descent, because the optimizer's work on each device is that of one device.
+    optimizer = optax.sgd(1e-3)
+    state = create_state(
+        variables,
+        optimizer,
+        use_ema=False,
+        is_frozen=getattr(model, "is_frozen", None),
+    )
+    grid = models.map_grid(small_models.small_grid(), model, "true")
+    step = make_train_step(model, optimizer, grid, loss=dict(config.loss))
+    return model, batch, state, step
+
+
+def _batch(config: Any) -> Batch:
+    rng = np.random.default_rng(0)
+    boxes = np.zeros((BATCH_SIZE, 3, 8), np.float32)
+    boxes[..., 0] = rng.uniform(5, 25, (BATCH_SIZE, 3))
+    boxes[..., 3:] = (4.4, 1.9, 1.6, 0.0, 1.0)
+    batch = Batch(
+        projection=small_models.projections(BATCH_SIZE),
+        boxes=boxes,
+        classes=np.zeros((BATCH_SIZE, 3), np.int32),
+        is_valid=np.tile([True, True, False], (BATCH_SIZE, 1)),
+        frame=np.arange(BATCH_SIZE, dtype=np.int32),
+    )
+    if config.model.name == "radenet":
+        return batch
+    camera = small_models.calibration().camera()
+    return batch.replace(
+        image=small_models.images(BATCH_SIZE),
+        camera=stack_cameras([camera] * BATCH_SIZE),
+    )
+
+
+@functools.cache
+def _compiled(
+    kind: str, num_devices: int, parameters: str = "replicated"
+) -> tuple[Any, Any]:
+    """A step that is compiled for some devices, and its arguments on them."""
+    _, batch, state, step = _case(kind)
+    mesh = distributed.make_mesh(num_devices)
+    whole = distributed.replicated(mesh)
+    placement = distributed.state_sharding(state, mesh, parameters, min_size=64)
+    arguments = (
+        jax.device_put(state, placement),
+        distributed.put_batch(batch, mesh),
+        jax.device_put(KEY, whole),
+    )
+    sharded = jax.jit(step, out_shardings=(placement, whole))
+    return sharded.lower(*arguments).compile(), arguments
+
+
+def _moved(program: Any) -> dict[str, list[int]]:
+    """Numbers of elements of the arrays that devices exchange, by the kind of exchange."""
+    moved: dict[str, list[int]] = {kind: [] for kind in COLLECTIVES.split("|")}
+    pattern = rf"= (.*?) ({COLLECTIVES})(?:-start)?\("
+    for result, kind in re.findall(pattern, program.as_text()):
+        for shape in re.findall(r"\w+\[([\d,]*)\]", result):
+            moved[kind].append(math.prod(map(int, filter(None, shape.split(",")))))
+    return moved
+
+
+def _num_operations(program: Any) -> float:
+    return program.cost_analysis()["flops"]
+
+
+@pytest.mark.parametrize(
+    ("kind", "num_devices"),
+    [
+        *(pytest.param(kind, 2, marks=pytest.mark.slow) for kind in KINDS),
+        *(pytest.param(kind, 4, marks=pytest.mark.slow) for kind in KINDS),
+        *((kind, 8) for kind in KINDS),
+    ],
+)
+def test_devices_share_the_work_of_a_step_and_send_only_gradients(
+    kind: str, num_devices: int
+) -> None:
+    one, arguments = _compiled(kind, 1)
+    program, shared = _compiled(kind, num_devices)
+    moved = _moved(program)
+    num_parameters = sum(x.size for x in jax.tree.leaves(arguments[0].params))
+    # Besides the gradients: sums of losses and counts, and statistics of batches.
+    assert 0 <= sum(moved.pop("all-reduce")) - num_parameters <= 100
+    assert not any(moved.values()), moved
+    share = _num_operations(program) / _num_operations(one)
+    assert share <= 1.1 / num_devices
+    expected, expected_metrics = one(*arguments)
+    actual, metrics = program(*shared)
+    chex.assert_trees_all_close(metrics, expected_metrics, rtol=1e-4, atol=1e-5)
+    chex.assert_trees_all_close(actual.params, expected.params, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_only_parameters_are_gathered_if_they_are_split(kind: str) -> None:
+    program, arguments = _compiled(kind, 4, "fsdp")
+    moved = _moved(program)
+    parameters = [x.size for x in jax.tree.leaves(arguments[0].params)]
+    frozen = [x.size for x in jax.tree.leaves(arguments[0].frozen)]
+    assert set(moved.pop("all-gather")) <= {*parameters, *frozen}
+    assert not moved.pop("all-to-all")
+    assert not moved.pop("collective-permute")
+    one, alone = _compiled(kind, 1)
+    expected, actual = one(*alone)[0], program(*arguments)[0]
+    chex.assert_trees_all_close(actual.params, expected.params, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["radar", "camera"])
+def test_devices_share_the_work_of_inference_and_gather_only_detections(
+    kind: str,
+) -> None:
+    inputs: tuple[Any, ...] = (small_models.projections(BATCH_SIZE),)
+    if kind == "camera":
+        camera = small_models.calibration().camera()
+        inputs += (
+            small_models.images(BATCH_SIZE),
+            stack_cameras([camera] * BATCH_SIZE),
+        )
+    programs = []
+    for num_devices in (1, 4):
+        mesh = distributed.make_mesh(num_devices)
+        detector = small_models.detector(
+            kind, sharding=distributed.batch_sharding(mesh)
+        )
+        placed = jax.tree.map(detector.put, inputs)
+        detect = jax.jit(detector.detect_function(), out_shardings=detector.replicated)
+        program = detect.lower(detector.variables, *placed).compile()
+        programs.append((program, program(detector.variables, *placed)))
+    (one, expected), (four, found) = programs
+    moved = _moved(four)
+    num_results = sum(x.size for x in jax.tree.leaves(expected))
+    assert sum(moved.pop("all-gather")) <= num_results
+    assert not any(moved.values()), moved
+    assert _num_operations(four) <= 1.1 / 4 * _num_operations(one)
+    chex.assert_trees_all_close(found, expected, rtol=1e-4, atol=1e-5)
