@@ -161,14 +161,29 @@ class Detector:
         self.decode_options = dataclasses.asdict(DecodeOptions(**config.decode))
         self.sharding = sharding or SingleDeviceSharding(jax.devices()[0])
         self.replicated = self.sharding
+        run = self.detect_function()
         if isinstance(self.sharding, NamedSharding):
-            self.replicated = NamedSharding(self.sharding.mesh, PartitionSpec())
+            mesh, frames, whole = (
+                self.sharding.mesh,
+                self.sharding.spec,
+                PartitionSpec(),
+            )
+            self.replicated = NamedSharding(mesh, whole)
+            # Each device computes its own frames. Partitioned by XLA, it would search the
+            # peaks of all frames.
+            run = jax.shard_map(
+                run,
+                mesh=mesh,
+                in_specs=(whole, frames, frames, frames, whole),
+                out_specs=frames,
+                check_vma=False,
+            )
         self._set_batch_sizes(batch_sizes)
         self.variables = jax.device_put(saved.variables, self.replicated)
         self.num_radar_only = self.num_invalid_frames = 0
         self._lock = threading.Lock()
         # Every process gets all detections: they are small.
-        self._run = jax.jit(self.detect_function(), out_shardings=self.replicated)
+        self._run = jax.jit(run, out_shardings=self.replicated)
         self._extremes = jax.jit(_extremes, out_shardings=self.replicated)
 
     @classmethod

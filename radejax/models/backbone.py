@@ -38,8 +38,8 @@ class ChannelAttention(layers.Layer):
         squeeze = layers.Dense(hidden, dtype=self.dtype, name="squeeze")
         excite = layers.Dense(channels, dtype=self.dtype, name="excite")
         mean = x.mean((1, 2), dtype=jnp.float32).astype(self.dtype)
-        pooled = jnp.stack([x.max((1, 2)), mean])  # [2, B, C]
-        weight = nn.sigmoid(excite(nn.relu(squeeze(pooled))).sum(0))
+        pooled = jnp.stack([x.max((1, 2)), mean], 1)  # [B, 2, C]
+        weight = nn.sigmoid(excite(nn.relu(squeeze(pooled))).sum(1))
         return x * weight[:, None, None]
 
 
