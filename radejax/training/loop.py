@@ -234,10 +234,14 @@ def _initial_variables(
 ) -> Any:
     """Creates the variables of step 0; the batch has the shapes of the model's inputs."""
     if variables is None:
-        keys = jax.random.split(jax.random.key(seed))
-        rngs = {"params": keys[0], "dropout": keys[1]}
-        variables = model.init(rngs, *batch.model_inputs(), train=False)
+        init_key, _ = _keys(seed)
+        variables = model.init(init_key, *batch.model_inputs(), train=False)
     return variables if pretrained is None else with_pretrained(variables, pretrained)
+
+
+def _keys(seed: int | jax.Array) -> jax.Array:
+    """Returns the keys of the initial parameters and of the steps."""
+    return jax.random.split(jax.random.key(seed))
 
 
 def _restore_or_initialize(
@@ -327,7 +331,8 @@ def _compile(
     whole = distributed.replicated(mesh)
     placement = jax.tree.map(lambda x: x.sharding, state)
     compiled = jax.jit(step, donate_argnums=0, out_shardings=(placement, whole))
-    rng = jax.jit(jax.random.key, out_shardings=whole)(np.uint32(seed + 1))
+    loop_key = jax.jit(lambda seed: _keys(seed)[1], out_shardings=whole)
+    rng = loop_key(np.uint32(seed))
     in_flight: collections.deque[Metrics] = collections.deque()
 
     def limited(state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
