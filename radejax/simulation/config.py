@@ -54,6 +54,28 @@ _RANGES = {
     "radar_from_lidar_m": errors.several(number(-math.inf), "three numbers", 3),
 }
 
+DEFAULT_PRESET = "ideal"
+"""Entry of `PRESETS` that `simulation.radar` extends if it does not name one as `preset`."""
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "ideal": {},
+    "realistic": {
+        "gain_db": (204.0, 208.0),
+        "noise_db": (108.0, 110.0),
+        "receiver_db": (-0.8, 0.8),
+        "range_profile": (0.8, 1.2),
+        "high_pass_m": (10.0, 14.0),
+        "leakage": (0.025, 0.05),
+        "range_correlation": (0.3, 0.44),
+        "beam_spread_db": (0.05, 0.12),
+        "ground_clutter": (0.001, 0.004),
+        "array_pedestal": 0.5,
+        "doppler_pedestal": 1.0,
+    },
+}
+"""Sensors: the fields of `RadarParameters` that differ from its defaults. Of two numbers,
+each sequence draws its own value between them. "ideal" is the sensor of version 0.3."""
+
 FULL_SIZE = {
     "grid": "kradar",
     "radar": {},
@@ -84,7 +106,8 @@ class SimulationConfig:
             in procedural training scenes, at most 5. Test scenes are not affected.
         grid: Arguments of `RadarGrid.reduced`; or the fields of a `RadarGrid`, whose axes
             are tuples of bin centers, empty without elevation or Doppler; or "kradar".
-        radar: Fields of `RadarParameters` that differ from its defaults.
+        radar: Name of an entry of `PRESETS` as `preset`, and fields of `RadarParameters`
+            that differ from it. Two numbers are a range from which each sequence draws.
         output: "tesseract" to write 4D tensors in K-Radar's file format, "projection" to
             write only projections.
         image_width: Width in pixels of each of the two stereo images; 0 for no images.
@@ -158,6 +181,8 @@ class SimulationConfig:
         else:
             is_one = self.vru_density_scale == 1
             self._require(is_one, "vru_density_scale", "1 for scenes of real labels")
+        named = {"preset": DEFAULT_PRESET} | dict(self.radar)
+        object.__setattr__(self, "radar", named)
         self.make_grid()
         self.make_parameters()
 
@@ -182,9 +207,17 @@ class SimulationConfig:
 
     def make_parameters(self) -> RadarParameters:
         """Returns the parameters of the radar other than its axes."""
+        given = dict(self.radar)
+        preset = given.pop("preset")
+        name = "config.simulation.radar.preset"
+        require(preset in PRESETS, name, preset, f"one of {', '.join(PRESETS)}")
+        fields = PRESETS[preset] | given
+        pairs = {n: v for n, v in fields.items() if isinstance(v, tuple | list)}
         try:
-            return RadarParameters(**self.radar)
-        except TypeError as error:
+            centers = {n: (low + high) / 2.0 for n, (low, high) in pairs.items()}
+            ranges = tuple((n, low, high) for n, (low, high) in pairs.items())
+            return RadarParameters(**fields | centers, ranges=ranges)
+        except (TypeError, ValueError) as error:
             raise UserError(f"config.simulation.radar: {error}") from None
 
     def to_json(self) -> str:
