@@ -13,7 +13,7 @@ from radejax.core import errors
 from radejax.core.config import plain
 from radejax.core.errors import UserError, integer, number, require
 from radejax.geometry.radar_grid import RadarGrid, is_uniform
-from radejax.simulation.radar.tensor import RadarParameters
+from radejax.simulation.radar.tensor import DRAWN, RadarParameters
 
 SIMULATOR_VERSION = 4
 """Version that increases whenever the same config gives different files than before."""
@@ -60,15 +60,16 @@ DEFAULT_PRESET = "ideal"
 PRESETS: dict[str, dict[str, Any]] = {
     "ideal": {},
     "realistic": {
-        "gain_db": (204.0, 208.0),
+        "gain_db": (207.0, 211.0),
+        "gain_doppler_bins": 64,
         "noise_db": (108.0, 110.0),
         "receiver_db": (-0.8, 0.8),
         "range_profile": (0.8, 1.2),
-        "high_pass_m": (10.0, 14.0),
-        "leakage": (0.025, 0.05),
+        "high_pass_m": (13.0, 17.0),
+        "leakage": (0.03, 0.07),
         "range_correlation": (0.3, 0.44),
         "beam_spread_db": (0.05, 0.12),
-        "ground_clutter": (0.001, 0.004),
+        "ground_clutter": (0.0002, 0.0006),
         "array_pedestal": 0.5,
         "doppler_pedestal": 1.0,
     },
@@ -78,7 +79,7 @@ each sequence draws its own value between them. "ideal" is the sensor of version
 
 FULL_SIZE = {
     "grid": "kradar",
-    "radar": {},
+    "radar": {"preset": DEFAULT_PRESET},
     "image_width": 1280,
     "image_height": 720,
 }
@@ -212,12 +213,19 @@ class SimulationConfig:
         name = "config.simulation.radar.preset"
         require(preset in PRESETS, name, preset, f"one of {', '.join(PRESETS)}")
         fields = PRESETS[preset] | given
-        pairs = {n: v for n, v in fields.items() if isinstance(v, tuple | list)}
+        ranges = []
+        for name in DRAWN & fields.keys():
+            value = fields[name]
+            if isinstance(value, list | tuple):
+                expected = "a number, or the lowest and the highest number"
+                require(
+                    len(value) == 2, f"config.simulation.radar.{name}", value, expected
+                )
+                fields[name] = value[0]
+                ranges.append((name, *value))
         try:
-            centers = {n: (low + high) / 2.0 for n, (low, high) in pairs.items()}
-            ranges = tuple((n, low, high) for n, (low, high) in pairs.items())
-            return RadarParameters(**fields | centers, ranges=ranges)
-        except (TypeError, ValueError) as error:
+            return RadarParameters(**{"ranges": tuple(sorted(ranges))} | fields)
+        except TypeError as error:
             raise UserError(f"config.simulation.radar: {error}") from None
 
     def to_json(self) -> str:

@@ -87,7 +87,7 @@ class SequenceSimulator:
         count = len(sequence.reflectors.kind)
         self._static_phase = rng.uniform(0.0, 2.0 * np.pi, count)
         rng = np.random.default_rng([seed, sequence.name, 13])
-        self.drawn = parameters.draw(rng)
+        self.drawn = parameters.draw(rng, grid.num_doppler)
         self._state = sensor.draw_state(grid, self.drawn, rng)
 
     def radar_input(self, frame: SceneFrame) -> RadarInput:

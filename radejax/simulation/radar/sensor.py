@@ -27,7 +27,7 @@ from radejax.simulation.radar.tensor import (
 
 _NEAR_PROFILE = np.array(
     [
-        (0.0, 42.0), (0.5, 12.0), (0.9, 6.0), (3.0, 6.0), (3.7, 3.5), (5.1, 0.5),
+        (0.0, 42.0), (0.46, 12.0), (0.9, 6.0), (3.0, 6.0), (3.7, 3.5), (5.1, 0.5),
         (7.0, -3.2), (9.3, -3.2), (11.0, -1.6), (15.0, -0.6), (30.0, 0.0),
     ]
 )  # fmt: skip
@@ -83,16 +83,21 @@ def draw_state(
     count = parameters.azimuth_elements, parameters.elevation_elements
     azimuth, elevation = (_phase_errors(n, parameters, rng) for n in count)
     # Neighboring beams share elements, so their gain varies smoothly.
-    smooth = np.convolve(rng.normal(size=grid.num_azimuth + 8), np.hanning(11)[1:-1])
-    spread = smooth[8:-8] / np.linalg.norm(np.hanning(11))
-    # The field of neighboring bins has a correlation of 2 c / (1 + 2 c^2).
-    field = np.sqrt(max(correlation, 1e-12))
-    side = (1.0 - np.sqrt(max(1.0 - 2.0 * correlation, 0.0))) / (2.0 * field)
+    window = np.hanning(11)
+    white = rng.normal(size=grid.num_azimuth + 10)
+    spread = np.convolve(white, window, "valid") / np.linalg.norm(window)
+    # A filter (c, 1, c) gives fields of neighboring bins, which are the roots of their
+    # powers, a correlation of 2 c / (1 + 2 c^2).
+    side, pedestal = 0.0, 0.0
+    if correlation:
+        side = (1.0 - np.sqrt(1.0 - 2.0 * correlation)) / (2.0 * np.sqrt(correlation))
+        pedestal = (1.0 - 2.0 * side) / (1.0 + 2.0 * side)
     return SensorState(
         azimuth_phase_rad=azimuth,
         elevation_phase_rad=elevation,
-        beam_gain=np.float32(10.0 ** (parameters.beam_spread_db * spread / 20.0)),
-        range_side=np.float32(side),
+        beam_gain=(10.0 ** (parameters.beam_spread_db * spread / 20.0)).astype("f4"),
+        range_pedestal=np.array(pedestal, np.float32),
+        range_side=np.array(side, np.float32),
     )
 
 
@@ -104,4 +109,5 @@ def _phase_errors(
     total = np.where(place > 0, 2.0 * weight, np.sqrt(2.0) * weight).sum()
     effective = total**2 / (2.0 * weight**2).sum()
     spread_rad = np.sqrt(np.log1p(parameters.leakage * effective))
-    return np.float32(np.where(place > 0, spread_rad * rng.normal(size=place.size), 0))
+    errors = np.where(place > 0, spread_rad * rng.normal(size=place.size), 0.0)
+    return errors.astype(np.float32)

@@ -37,6 +37,7 @@ TESSERACT_OF_ROWS = (2, 0, 1, 3)
 
 _RANGES = {
     "gain_db": number(-1e3, 1e3),
+    "gain_doppler_bins": integer(0),
     "noise_db": number(-1e3, 1e3),
     "receiver_db": number(-100, 100),
     "range_profile": number(0, 2),
@@ -56,16 +57,18 @@ _RANGES = {
 }
 
 
-DRAWN = (
-    "gain_db",
-    "noise_db",
-    "receiver_db",
-    "range_profile",
-    "high_pass_m",
-    "leakage",
-    "range_correlation",
-    "beam_spread_db",
-    "ground_clutter",
+DRAWN = frozenset(
+    (
+        "gain_db",
+        "noise_db",
+        "receiver_db",
+        "range_profile",
+        "high_pass_m",
+        "leakage",
+        "range_correlation",
+        "beam_spread_db",
+        "ground_clutter",
+    )
 )
 """Fields of `RadarParameters` that can differ between sequences."""
 
@@ -82,6 +85,8 @@ class RadarParameters:
     Attributes:
         gain_db: Received power in dB from a target of 0 dBsm at 1 m on boresight, without
             the high-pass filter.
+        gain_doppler_bins: Number of Doppler bins for which the gain is given. Fewer bins
+            integrate fewer chirps, so the gain is less; 0 for the same gain of all numbers.
         noise_db: Mean noise power per cell in dB.
         receiver_db: Gain of the receiver in dB, which amplifies echoes and noise.
         range_profile: Factor on the profile over range in dB that K-Radar's noise has: the
@@ -116,6 +121,7 @@ class RadarParameters:
     """
 
     gain_db: float = 178.0
+    gain_doppler_bins: int = 0
     noise_db: float = 95.0
     receiver_db: float = 0.0
     range_profile: float = 0.0
@@ -138,16 +144,26 @@ class RadarParameters:
         section = "config.simulation.radar"
         check_options(vars(self), section, _RANGES)
         for name, low, high in self.ranges:
-            is_range = name in DRAWN and low <= high
-            expected = f"a rising range of one of {', '.join(DRAWN)}"
-            require(is_range, f"{section}.{name}", (low, high), expected)
+            drawn = ", ".join(sorted(DRAWN))
+            require(name in DRAWN, f"a field with a range in {section}", name, drawn)
             for end in (low, high):
                 check_options(vars(self) | {name: end}, section, _RANGES)
+            is_rising, pair = low <= high, (low, high)
+            require(is_rising, f"{section}.{name}", pair, "the lower number first")
 
-    def draw(self, rng: np.random.Generator) -> RadarParameters:
-        """Returns the parameters of one sequence, drawn uniformly from their ranges."""
-        drawn = {name: rng.uniform(low, high) for name, low, high in self.ranges}
-        return dataclasses.replace(self, ranges=(), **drawn)
+    def draw(self, rng: np.random.Generator, num_doppler: int) -> RadarParameters:
+        """Returns the parameters of one sequence for a number of Doppler bins.
+
+        They are drawn uniformly from their ranges.
+        """
+        drawn: dict[str, Any] = {
+            name: rng.uniform(low, high) for name, low, high in self.ranges
+        }
+        if self.gain_doppler_bins:
+            share = max(num_doppler, 1) / self.gain_doppler_bins
+            drawn["gain_db"] = drawn.get("gain_db", self.gain_db) + 10 * np.log10(share)
+        changes = {"ranges": (), "gain_doppler_bins": 0, **drawn}
+        return dataclasses.replace(self, **changes)
 
 
 class SensorState(struct.PyTreeNode):
@@ -159,12 +175,14 @@ class SensorState(struct.PyTreeNode):
             response real and therefore needs no more computation than an ideal array.
         elevation_phase_rad: The same of the array in elevation.
         beam_gain: Gain of the amplitudes in each azimuth bin.
-        range_side: Amplitude of the range window's response in the two bins beside its peak.
+        range_pedestal: Pedestal of the range window that echoes pass.
+        range_side: Amplitude of the two neighbors in the filter of the noise over range.
     """
 
     azimuth_phase_rad: Float[Array, " P"]
     elevation_phase_rad: Float[Array, " Q"]
     beam_gain: Float[Array, " A"]
+    range_pedestal: Float[Array, ""]
     range_side: Float[Array, ""]
 
 
@@ -293,8 +311,7 @@ def simulate(
     if state is not None:
         errors = state.elevation_phase_rad, state.azimuth_phase_rad
         azimuth_basis = azimuth_basis * state.beam_gain[:, None]
-        side = state.range_side
-        range_pedestal = (1.0 - 2.0 * side) / (1.0 + 2.0 * side)
+        range_pedestal = state.range_pedestal
     elevation = array_signal(scatterers.elevation_rad, m, pedestal, errors[0])  # [M, S]
     azimuth = array_signal(scatterers.azimuth_rad, n, pedestal, errors[1])  # [N, S]
     doppler = doppler_response(
