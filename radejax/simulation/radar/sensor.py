@@ -27,11 +27,12 @@ from radejax.simulation.radar.tensor import (
 
 _NEAR_PROFILE = np.array(
     [
-        (0.0, 42.0), (0.46, 12.0), (0.9, 6.0), (3.0, 6.0), (3.7, 3.5), (5.1, 0.5),
-        (7.0, -3.2), (9.3, -3.2), (11.0, -1.6), (15.0, -0.6), (30.0, 0.0),
+        (0.0, 42.0), (0.46, 12.0), (0.9, 6.0), (3.0, 6.0), (3.7, 3.5), (5.1, 0.0),
+        (6.5, -5.0), (9.3, -5.0), (12.0, -2.0), (16.0, -0.7), (30.0, 0.0),
     ]
 )  # fmt: skip
-"""Distance in m, and noise in dB relative to that of medium ranges."""
+"""Distance in m, and noise in dB relative to that of medium ranges. The dip is 2 dB deeper than
+that of the map, in which near echoes leak into it."""
 
 _FAR_PROFILE = np.array(
     [
