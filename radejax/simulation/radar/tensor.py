@@ -35,9 +35,8 @@ TESSERACT_OF_ROWS = (2, 0, 1, 3)
 """Permutation of the axes from rows `[R, E, D, A]` to a tesseract `[D, R, E, A]`."""
 
 
-_RANGES = {
+_DRAWN_RANGES = {
     "gain_db": number(-1e3, 1e3),
-    "gain_doppler_bins": integer(0),
     "noise_db": number(-1e3, 1e3),
     "receiver_db": number(-100, 100),
     "range_profile": number(0, 2),
@@ -46,6 +45,9 @@ _RANGES = {
     "range_correlation": number(0, 4 / 9),
     "beam_spread_db": number(0, 3),
     "ground_clutter": number(0, 1),
+}
+_RANGES = _DRAWN_RANGES | {
+    "gain_doppler_bins": integer(0),
     "wavelength_m": number(1e-4, 1),
     "azimuth_elements": number(1, 512),
     "elevation_elements": number(1, 512),
@@ -56,20 +58,7 @@ _RANGES = {
     "max_scatterers_per_row": integer(1, 4096),
 }
 
-
-DRAWN = frozenset(
-    (
-        "gain_db",
-        "noise_db",
-        "receiver_db",
-        "range_profile",
-        "high_pass_m",
-        "leakage",
-        "range_correlation",
-        "beam_spread_db",
-        "ground_clutter",
-    )
-)
+DRAWN = frozenset(_DRAWN_RANGES)
 """Fields of `RadarParameters` that can differ between sequences."""
 
 
@@ -144,12 +133,10 @@ class RadarParameters:
         section = "config.simulation.radar"
         check_options(vars(self), section, _RANGES)
         for name, low, high in self.ranges:
-            drawn = ", ".join(sorted(DRAWN))
-            require(name in DRAWN, f"a field with a range in {section}", name, drawn)
             for end in (low, high):
                 check_options(vars(self) | {name: end}, section, _RANGES)
-            is_rising, pair = low <= high, (low, high)
-            require(is_rising, f"{section}.{name}", pair, "the lower number first")
+            order = "the lower number first"
+            require(low <= high, f"{section}.{name}", (low, high), order)
 
     def draw(self, rng: np.random.Generator, num_doppler: int) -> RadarParameters:
         """Returns the parameters of one sequence for a number of Doppler bins.
@@ -306,20 +293,15 @@ def simulate(
     m, n = parameters.elevation_elements, parameters.azimuth_elements
     elevation_basis = array_basis(elevation_rad, m, pedestal)
     azimuth_basis = array_basis(grid.azimuth_rad, n, pedestal)
-    errors: tuple[Any, Any] = (None, None)
-    range_pedestal: Any = 0.0
-    if state is not None:
-        errors = state.elevation_phase_rad, state.azimuth_phase_rad
+    if state:
         azimuth_basis = azimuth_basis * state.beam_gain[:, None]
-        range_pedestal = state.range_pedestal
-    elevation = array_signal(scatterers.elevation_rad, m, pedestal, errors[0])  # [M, S]
-    azimuth = array_signal(scatterers.azimuth_rad, n, pedestal, errors[1])  # [N, S]
-    doppler = doppler_response(
-        scatterers.velocity_mps, grid, parameters.doppler_pedestal
-    )  # [D, S]
-    in_range = range_response(
-        scatterers.range_m, grid, parameters, range_pedestal
-    )  # [R, S]
+    phases = state and state.elevation_phase_rad, state and state.azimuth_phase_rad
+    elevation = array_signal(scatterers.elevation_rad, m, pedestal, phases[0])  # [M, S]
+    azimuth = array_signal(scatterers.azimuth_rad, n, pedestal, phases[1])  # [N, S]
+    window = parameters.doppler_pedestal
+    doppler = doppler_response(scatterers.velocity_mps, grid, window)  # [D, S]
+    of_range = state.range_pedestal if state else 0.0
+    in_range = range_response(scatterers.range_m, grid, parameters, of_range)  # [R, S]
     magnitude = jnp.linalg.norm(scatterers.amplitude, axis=-1)
     num_kept = min(parameters.max_scatterers_per_row, magnitude.shape[0])
     _, kept = lax.top_k(jnp.abs(in_range) * magnitude[None], num_kept)  # [R, K]
@@ -333,10 +315,9 @@ def simulate(
         )  # [K, 2 N]
         received = _product(left.reshape(-1, num_kept), right)
         white = _white_noise(received.size, key, row_idx)
-        if state is not None:
+        if state:
             white = _correlate(white, state.range_side, key, row_idx)
-        filtered = _noise(noise, white, parameters.doppler_pedestal)
-        received += filtered.reshape(received.shape)
+        received += _noise(noise, white, window).reshape(received.shape)
         beams = _beams(received, elevation_basis, azimuth_basis)
         power = jnp.square(beams).sum(axis=2)  # [E, D, A]
         if output != "projection":
