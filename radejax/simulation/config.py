@@ -182,6 +182,8 @@ class SimulationConfig:
         else:
             is_one = self.vru_density_scale == 1
             self._require(is_one, "vru_density_scale", "1 for scenes of real labels")
+        is_mapping = isinstance(self.radar, Mapping)
+        self._require(is_mapping, "radar", "a preset and fields of RadarParameters")
         named = {"preset": DEFAULT_PRESET} | dict(self.radar)
         object.__setattr__(self, "radar", named)
         self.make_grid()

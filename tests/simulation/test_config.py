@@ -82,6 +82,7 @@ def test_fingerprint_follows_every_change():
         ({"radar": {"noise_db": (3.0, 1.0)}}, "noise_db is .*the lower number first"),
         ({"radar": {"noise_db": (1, 2, 3)}}, "noise_db is .*lowest and the highest"),
         ({"radar": {"leakage": (0.1, 9.0)}}, "leakage is 9.0, expected a number"),
+        ({"radar": "realistic"}, "radar is 'realistic', expected a preset and fields"),
         ({"radar": {"preset": "perfect"}}, "expected one of ideal, realistic"),
         (
             {"radar": {"max_scatterers_per_row": 9.5}},

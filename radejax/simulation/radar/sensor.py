@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 from jaxtyping import Float
+from scipy.special import ndtri
 
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.radar.tensor import (
@@ -27,7 +28,7 @@ from radejax.simulation.radar.tensor import (
 
 _NEAR_PROFILE = np.array(
     [
-        (0.0, 42.0), (0.46, 12.0), (0.9, 6.0), (3.0, 6.0), (3.7, 3.5), (5.1, 0.0),
+        (0.0, 45.0), (0.46, 12.0), (0.9, 6.0), (3.0, 6.0), (3.7, 3.5), (5.1, 0.0),
         (6.5, -5.0), (9.3, -5.0), (12.0, -2.0), (16.0, -0.7), (30.0, 0.0),
     ]
 )  # fmt: skip
@@ -105,10 +106,15 @@ def draw_state(
 def _phase_errors(
     elements: float, parameters: RadarParameters, rng: np.random.Generator
 ) -> Float[np.ndarray, " P"]:
-    """Draws the phase errors of one element of each pair, whose leakage is as wanted."""
+    """Draws the phase errors of one element of each pair, whose leakage is as wanted.
+
+    They are the quantiles of a normal distribution in random order. Independent numbers
+    would cancel the peak of the beam in some sequences.
+    """
     place, weight = element_pairs(elements, parameters.array_pedestal)
     total = np.where(place > 0, 2.0 * weight, np.sqrt(2.0) * weight).sum()
     effective = total**2 / (2.0 * weight**2).sum()
     spread_rad = np.sqrt(np.log1p(parameters.leakage * effective))
-    errors = np.where(place > 0, spread_rad * rng.normal(size=place.size), 0.0)
-    return errors.astype(np.float32)
+    quantiles = ndtri((np.arange(place.size) + 0.5) / place.size)
+    errors = spread_rad * rng.permutation(quantiles)
+    return np.where(place > 0, errors, 0.0).astype(np.float32)

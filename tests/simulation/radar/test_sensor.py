@@ -99,7 +99,7 @@ class TestNoise:
         def median(low, high):
             return np.median(profile[(grid.range_m >= low) & (grid.range_m < high)])
 
-        assert profile[0] == pytest.approx(42.0, abs=0.1)
+        assert profile[0] == pytest.approx(45.0, abs=0.1)
         assert median(0, 1) == pytest.approx(12.0, abs=1.0)
         assert median(1, 5) == pytest.approx(4.0, abs=2.0)
         assert median(5, 10) == pytest.approx(-5.0, abs=0.5)
@@ -183,8 +183,8 @@ class TestLeakage:
             power.append(np.square(basis @ np.asarray(signal)[:, 0]))
         assert np.array(power)[:, 20] == pytest.approx(1.0, abs=1e-4)
         away = np.array(power)[:, 60:]
-        # A coherent sum that is weak by chance makes its leakage strong.
-        assert 10 * np.log10(np.median(away.mean(1))) == pytest.approx(-14.0, abs=1.5)
+        assert 10 * np.log10(away.mean()) == pytest.approx(-14.0, abs=1.0)
+        assert away.mean(1).max() < 5.0 * away.mean()  # also in the worst sequence
 
     def test_pattern_moves_with_the_target(self):
         state = state_of(leakage=0.05)
