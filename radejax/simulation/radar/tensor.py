@@ -293,14 +293,15 @@ def simulate(
     m, n = parameters.elevation_elements, parameters.azimuth_elements
     elevation_basis = array_basis(elevation_rad, m, pedestal)
     azimuth_basis = array_basis(grid.azimuth_rad, n, pedestal)
-    if state:
+    up = None if state is None else state.elevation_phase_rad
+    across = None if state is None else state.azimuth_phase_rad
+    elevation = array_signal(scatterers.elevation_rad, m, pedestal, up)  # [M, S]
+    azimuth = array_signal(scatterers.azimuth_rad, n, pedestal, across)  # [N, S]
+    if state is not None:
         azimuth_basis = azimuth_basis * state.beam_gain[:, None]
-    phases = state and state.elevation_phase_rad, state and state.azimuth_phase_rad
-    elevation = array_signal(scatterers.elevation_rad, m, pedestal, phases[0])  # [M, S]
-    azimuth = array_signal(scatterers.azimuth_rad, n, pedestal, phases[1])  # [N, S]
     window = parameters.doppler_pedestal
     doppler = doppler_response(scatterers.velocity_mps, grid, window)  # [D, S]
-    of_range = state.range_pedestal if state else 0.0
+    of_range = 0.0 if state is None else state.range_pedestal
     in_range = range_response(scatterers.range_m, grid, parameters, of_range)  # [R, S]
     magnitude = jnp.linalg.norm(scatterers.amplitude, axis=-1)
     num_kept = min(parameters.max_scatterers_per_row, magnitude.shape[0])
@@ -315,7 +316,7 @@ def simulate(
         )  # [K, 2 N]
         received = _product(left.reshape(-1, num_kept), right)
         white = _white_noise(received.size, key, row_idx)
-        if state:
+        if state is not None:
             white = _correlate(white, state.range_side, key, row_idx)
         received += _noise(noise, white, window).reshape(received.shape)
         beams = _beams(received, elevation_basis, azimuth_basis)
