@@ -132,11 +132,12 @@ class OnlineBatches:
             boxes[row, : len(order)] = boxes8_from_7(own[order])
             classes[row, : len(order)] = cls[order]
             is_valid[row, : len(order)] = True
-        scatterers, noise = _stack([given for _, given, *_ in frames])
+        scatterers, noise, state = _stack([given for _, given, *_ in frames])
         projection = _simulate_batch(
             scatterers,
             noise,
             np.stack([key for _, _, key, *_ in frames]),
+            state,
             self.grid,
             self._parameters,
         )
@@ -149,18 +150,20 @@ class OnlineBatches:
         )
 
 
-@functools.partial(jax.jit, static_argnums=(3, 4))
-def _simulate_batch(scatterers, noise, keys, grid, parameters):
+@functools.partial(jax.jit, static_argnums=(4, 5))
+def _simulate_batch(scatterers, noise, keys, state, grid, parameters):
     """Computes the projections `[B, R, A, D+E]` of a batch."""
     one = functools.partial(
         tensor.simulate,
         grid=grid,
         parameters=parameters,
     )
-    return jax.vmap(one)(scatterers, noise, keys)
+    return jax.vmap(one)(scatterers, noise, keys, state)
 
 
-def _stack(inputs: list[RadarInput]) -> tuple[tensor.Scatterers, np.ndarray]:
+def _stack(
+    inputs: list[RadarInput],
+) -> tuple[tensor.Scatterers, np.ndarray, tensor.SensorState | None]:
     """Stacks inputs, padded to a multiple of 1,024 scatterers to limit recompilation."""
     capacity = max(given.scatterers.range_m.shape[0] for given in inputs)
     capacity = -(-capacity // 1024) * 1024
@@ -172,4 +175,7 @@ def _stack(inputs: list[RadarInput]) -> tuple[tensor.Scatterers, np.ndarray]:
         lambda *leaves: np.stack([pad(leaf) for leaf in leaves]),
         *[given.scatterers for given in inputs],
     )
-    return scatterers, np.stack([given.noise_power for given in inputs])
+    state = jax.tree.map(
+        lambda *leaves: np.stack(leaves), *[given.state for given in inputs]
+    )
+    return scatterers, np.stack([given.noise_power for given in inputs]), state

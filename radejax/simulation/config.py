@@ -13,7 +13,7 @@ from radejax.core import errors
 from radejax.core.config import plain
 from radejax.core.errors import UserError, integer, number, require
 from radejax.geometry.radar_grid import RadarGrid, is_uniform
-from radejax.simulation.radar.tensor import RadarParameters
+from radejax.simulation.radar.tensor import DRAWN, RadarParameters
 
 SIMULATOR_VERSION = 4
 """Version that increases whenever the same config gives different files than before."""
@@ -54,9 +54,32 @@ _RANGES = {
     "radar_from_lidar_m": errors.several(number(-math.inf), "three numbers", 3),
 }
 
+DEFAULT_PRESET = "ideal"
+"""Entry of `PRESETS` that `simulation.radar` extends if it does not name one as `preset`."""
+
+PRESETS: dict[str, dict[str, Any]] = {
+    "ideal": {},
+    "realistic": {
+        "gain_db": (206.0, 210.0),
+        "gain_doppler_bins": 64,
+        "noise_db": (108.0, 110.0),
+        "receiver_db": (-0.8, 0.8),
+        "range_profile": (0.8, 1.2),
+        "high_pass_m": (13.0, 17.0),
+        "leakage": (0.035, 0.07),
+        "range_correlation": (0.25, 0.4),
+        "beam_spread_db": (0.05, 0.12),
+        "ground_clutter": (0.0001, 0.0004),
+        "array_pedestal": 0.5,
+        "doppler_pedestal": 1.0,
+    },
+}
+"""Sensors: the fields of `RadarParameters` that differ from its defaults. Of two numbers,
+each sequence draws its own value between them. "ideal" is the sensor of version 0.3."""
+
 FULL_SIZE = {
     "grid": "kradar",
-    "radar": {},
+    "radar": {"preset": DEFAULT_PRESET},
     "image_width": 1280,
     "image_height": 720,
 }
@@ -84,7 +107,8 @@ class SimulationConfig:
             in procedural training scenes, at most 5. Test scenes are not affected.
         grid: Arguments of `RadarGrid.reduced`; or the fields of a `RadarGrid`, whose axes
             are tuples of bin centers, empty without elevation or Doppler; or "kradar".
-        radar: Fields of `RadarParameters` that differ from its defaults.
+        radar: Name of an entry of `PRESETS` as `preset`, and fields of `RadarParameters`
+            that differ from it. Two numbers are a range from which each sequence draws.
         output: "tesseract" to write 4D tensors in K-Radar's file format, "projection" to
             write only projections.
         image_width: Width in pixels of each of the two stereo images; 0 for no images.
@@ -158,6 +182,10 @@ class SimulationConfig:
         else:
             is_one = self.vru_density_scale == 1
             self._require(is_one, "vru_density_scale", "1 for scenes of real labels")
+        is_mapping = isinstance(self.radar, Mapping)
+        self._require(is_mapping, "radar", "a preset and fields of RadarParameters")
+        named = {"preset": DEFAULT_PRESET} | dict(self.radar)
+        object.__setattr__(self, "radar", named)
         self.make_grid()
         self.make_parameters()
 
@@ -182,8 +210,23 @@ class SimulationConfig:
 
     def make_parameters(self) -> RadarParameters:
         """Returns the parameters of the radar other than its axes."""
+        given = dict(self.radar)
+        preset = given.pop("preset")
+        name = "config.simulation.radar.preset"
+        require(preset in PRESETS, name, preset, f"one of {', '.join(PRESETS)}")
+        fields = PRESETS[preset] | given
+        ranges = []
+        for name in DRAWN & fields.keys():
+            value = fields[name]
+            if isinstance(value, list | tuple):
+                expected = "a number, or the lowest and the highest number"
+                require(
+                    len(value) == 2, f"config.simulation.radar.{name}", value, expected
+                )
+                fields[name] = value[0]
+                ranges.append((name, *value))
         try:
-            return RadarParameters(**self.radar)
+            return RadarParameters(**{"ranges": tuple(sorted(ranges))} | fields)
         except TypeError as error:
             raise UserError(f"config.simulation.radar: {error}") from None
 

@@ -18,7 +18,7 @@ from radejax.data.kradar.dataset import split_by_rule
 from radejax.data.kradar.labels import Label, LabelHeader
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.config import SimulationConfig
-from radejax.simulation.radar import propagation, scattering, tensor
+from radejax.simulation.radar import propagation, scattering, sensor, tensor
 from radejax.simulation.world import scene
 from radejax.simulation.world.replay import make_real_sequence
 from radejax.simulation.world.scene import SceneFrame, Sequence
@@ -38,6 +38,7 @@ class RadarInput(NamedTuple):
         scatterers: Point targets.
         noise_power: Mean noise power of each range and Doppler bin.
         key: Random key of the noise.
+        state: Imperfections of the sensor in this sequence, or None for an ideal one.
         snr_db: Ratio of the total power of each box's scatterers to the receiver noise.
         lit: Fraction of each box's power that no other box blocks.
     """
@@ -45,13 +46,14 @@ class RadarInput(NamedTuple):
     scatterers: tensor.Scatterers
     noise_power: Float[np.ndarray, "R D"]
     key: UInt32[np.ndarray, "2"]
+    state: tensor.SensorState | None
     snr_db: Float[np.ndarray, " N"]
     lit: Float[np.ndarray, " N"]
 
     @property
     def arrays(self) -> tuple[Any, ...]:
         """The arrays from which `tensor.simulate` computes the frame."""
-        return self.scatterers, self.noise_power, self.key
+        return self.scatterers, self.noise_power, self.key, self.state
 
 
 class SequenceSimulator:
@@ -63,9 +65,10 @@ class SequenceSimulator:
     Args:
         sequence: Scene of the sequence.
         grid: Axes of the radar.
-        parameters: Parameters of the radar other than its axes.
-        seed: Seed of scattering centers, phases and noise, in addition to the number of
-            the sequence and the index of the frame.
+        parameters: Parameters of the radar other than its axes, some of which each
+            sequence draws.
+        seed: Seed of scattering centers, phases, noise and drawn parameters, in addition to
+            the number of the sequence and the index of the frame.
     """
 
     def __init__(
@@ -83,10 +86,13 @@ class SequenceSimulator:
         self._centers = scattering.make_object_scatterers(tracks.cls, sizes_m, rng)
         count = len(sequence.reflectors.kind)
         self._static_phase = rng.uniform(0.0, 2.0 * np.pi, count)
+        rng = np.random.default_rng([seed, sequence.name, 13])
+        self.drawn = parameters.draw(rng, grid.num_doppler)
+        self._state = sensor.draw_state(grid, self.drawn, rng)
 
     def radar_input(self, frame: SceneFrame) -> RadarInput:
         """Computes scatterers and noise of a frame as NumPy input of `tensor.simulate`."""
-        sequence, parameters = self.sequence, self.parameters
+        sequence, parameters = self.sequence, self.drawn
         objects, lit = scattering.scatter_objects(frame, self._centers, parameters)
         static = scattering.scatter_surroundings(frame, self._static_phase, parameters)
         ghosts = scattering.scatter_ghosts(objects, sequence.mirrors_m)
@@ -107,6 +113,7 @@ class SequenceSimulator:
             phase_rad=found.phase_rad + np.angle(bounce),
         )
         power = np.bincount(objects.owner, found.power[:count], len(frame.boxes))
+        noise_db = parameters.noise_db + parameters.receiver_db
         return RadarInput(
             scatterers=scattering.to_scatterers(
                 found, frame.ego_velocity_mps, parameters.wavelength_m
@@ -115,7 +122,8 @@ class SequenceSimulator:
                 sequence.weather, self.grid, parameters, frame.ego_velocity_mps
             ),
             key=tensor.frame_key(self.seed, sequence.name, frame.index),
-            snr_db=10.0 * np.log10(power + 1e-30) - parameters.noise_db,
+            state=self._state,
+            snr_db=10.0 * np.log10(power + 1e-30) - noise_db,
             lit=lit,
         )
 

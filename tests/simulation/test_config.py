@@ -79,6 +79,11 @@ def test_fingerprint_follows_every_change():
         ),
         ({"radar": {"gain_db": float("nan")}}, "radar.gain_db is nan"),
         ({"radar": {"noise_db": "loud"}}, "radar.noise_db is 'loud'"),
+        ({"radar": {"noise_db": (3.0, 1.0)}}, "noise_db is .*the lower number first"),
+        ({"radar": {"noise_db": (1, 2, 3)}}, "noise_db is .*lowest and the highest"),
+        ({"radar": {"leakage": (0.1, 9.0)}}, "leakage is 9.0, expected a number"),
+        ({"radar": "realistic"}, "radar is 'realistic', expected a preset and fields"),
+        ({"radar": {"preset": "perfect"}}, "expected one of ideal, realistic"),
         (
             {"radar": {"max_scatterers_per_row": 9.5}},
             "is 9.5, expected an integer of at least 1 and at most 4096",

@@ -129,6 +129,22 @@ class TestRepeating:
         )
         assert digests(again) == digests(tree)
 
+    def test_realistic_radar_does_not_depend_on_the_number_of_processes(self, tmp_path):
+        config = small_config(radar={"preset": "realistic"}, frames_per_sequence=1)
+        found = [
+            digests(
+                simulate_dataset(
+                    config, tmp_path / str(count), num_workers=count, progress=False
+                )
+            )
+            for count in (0, 1, 2)
+        ]
+        assert found[0] == found[1] == found[2]
+        ideal = simulate_dataset(
+            config | {"radar": {}}, tmp_path / "ideal", progress=False
+        )
+        assert digests(ideal) != found[0]
+
     def test_resumes_after_an_interruption_with_the_same_bytes(
         self, tree, tmp_path, monkeypatch
     ):

@@ -38,6 +38,7 @@ import numpy as np
 from jaxtyping import Complex, Float, Inexact
 
 from radejax.geometry.radar_grid import RadarGrid
+from radejax.simulation.radar import sensor
 from radejax.simulation.radar.tensor import RadarParameters
 
 Cells = Float[np.ndarray, "*cells"]
@@ -105,35 +106,59 @@ def noise_profile(
     parameters: RadarParameters,
     ego_velocity_mps: Float[np.ndarray, "2"],
 ) -> Float[np.ndarray, "R D"]:
-    """Computes the mean power of receiver noise and backscatter per range-Doppler cell.
+    """Computes the mean power of noise, ground clutter and backscatter by range and Doppler.
 
-    The echoes of many drops in one cell add up to a complex Gaussian, so they are modeled
-    as noise and not as scatterers. At range R, the cell of a beam of solid angle W has a
-    volume of R^2 W dR, so its power falls with R^-2. Drops have no mean velocity over
-    ground. Their range rate is minus the ego speed plus a spread, on a Doppler axis that
-    wraps around.
+    The echoes of many drops, or of many stones and leaves, in one cell add up to a complex
+    Gaussian, so they are modeled as noise and not as scatterers. At range R, the cell of a
+    beam of solid angle W has a volume of R^2 W dR, so the power of drops falls with R^-2.
+    Drops have no mean velocity over ground. Their range rate is minus the ego speed plus a
+    spread, on a Doppler axis that wraps around. The ground fills R dR of a beam's width.
+    Its range rates are those of points at rest in all azimuth bins.
 
     Returns:
         float32 linear power.
     """
     law = WEATHERS[weather]
-    beam = (2.4 / parameters.azimuth_elements) * (2.4 / parameters.elevation_elements)
+    width = 2.4 / parameters.azimuth_elements
+    beam = width * (2.4 / parameters.elevation_elements)
     distance = np.maximum(grid.range_m, 1.0)
     volume = distance**2 * beam * grid.range_widths_m
-    gain = 10.0 ** ((parameters.gain_db + law.backscatter_db) / 10.0)
-    clutter = gain * (volume / distance**4 * attenuation(weather, distance))
-    share = np.ones(1)
-    if grid.num_doppler > 1:
-        step = grid.doppler_mps[1] - grid.doppler_mps[0]
-        period = step * grid.num_doppler
-        offset = grid.doppler_mps + ego_velocity_mps[0]
-        folds = np.arange(-6, 7) * period
-        offset = np.mod(offset + period / 2, period) - period / 2
-        spread = (offset[:, None] + folds) / law.spread_mps
-        density = np.exp(-0.5 * spread**2).sum(1)
-        share = density / density.sum()
-    noise = 10.0 ** (parameters.noise_db / 10.0)
-    return (noise + clutter[:, None] * share[None]).astype(np.float32)
+    area = distance * width * grid.range_widths_m
+    level_db = parameters.gain_db + parameters.receiver_db
+    way = attenuation(weather, distance)
+    way = way * sensor.high_pass(distance, parameters.high_pass_m)
+    gain = 10.0 ** ((level_db + law.backscatter_db) / 10.0)
+    rain = gain * (volume / distance**4 * way)
+    gain = 10.0 ** (level_db / 10.0) * parameters.ground_clutter
+    ground = gain * (area / distance**4 * way)
+    speed = ego_velocity_mps[:1]
+    of_rain = _doppler_share(-speed, law.spread_mps, grid)
+    of_ground = _doppler_share(-speed * np.cos(grid.azimuth_rad), None, grid)
+    noise = sensor.receiver_noise(grid, parameters)
+    noise = noise + rain[:, None] * of_rain + ground[:, None] * of_ground
+    return noise.astype(np.float32)
+
+
+def _doppler_share(
+    mean_mps: Float[np.ndarray, " K"], spread_mps: float | None, grid: RadarGrid
+) -> Float[np.ndarray, " D"]:
+    """Returns the fraction of power in each Doppler bin.
+
+    Args:
+        mean_mps: Range rates.
+        spread_mps: Standard deviation around each of them, or None for half a bin.
+        grid: Sensor axes, whose Doppler axis wraps around.
+    """
+    if grid.num_doppler < 2:
+        return np.ones(1)
+    step = grid.doppler_mps[1] - grid.doppler_mps[0]
+    period = step * grid.num_doppler
+    folds = np.arange(-6, 7) * period
+    offset = grid.doppler_mps - mean_mps[:, None]  # [K, D]
+    offset = np.mod(offset + period / 2, period) - period / 2
+    spread = (offset[..., None] + folds) / (spread_mps or step / 2.0)
+    density = np.exp(-0.5 * spread**2).sum(-1)
+    return (density / density.sum(-1, keepdims=True)).mean(0)
 
 
 def reflection(

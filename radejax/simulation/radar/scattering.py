@@ -31,6 +31,7 @@ from jaxtyping import Float, Int
 from numpy.random import Generator
 
 from radejax.core.structures import CLASSES
+from radejax.simulation.radar import sensor
 from radejax.simulation.radar.tensor import RadarParameters, Scatterers
 from radejax.simulation.world import scene
 from radejax.simulation.world.scene import SceneFrame
@@ -253,11 +254,16 @@ def scatter_objects(
 def received_power(
     position_m: Vectors, rcs_m2: Values, parameters: RadarParameters
 ) -> Values:
-    """Computes linear power by the radar equation, gain x cross-section x pattern / R^4."""
+    """Computes linear power by the radar equation, gain x cross-section x pattern / R^4.
+
+    The gain includes the receiver's high-pass filter.
+    """
     distance = np.maximum(np.linalg.norm(position_m, axis=1), 1.0)
     forward = np.clip(position_m[:, 0] / distance, 0.0, 1.0)
     pattern = forward**parameters.pattern_exponent
-    return 10.0 ** (parameters.gain_db / 10.0) * rcs_m2 * pattern / distance**4
+    gain = 10.0 ** ((parameters.gain_db + parameters.receiver_db) / 10.0)
+    passed = sensor.high_pass(distance, parameters.high_pass_m)
+    return gain * rcs_m2 * pattern / distance**4 * passed
 
 
 CAPACITY_STEP = 512

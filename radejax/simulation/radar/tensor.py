@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +22,7 @@ from flax import struct
 from jax import lax
 from jaxtyping import Float, UInt32
 
-from radejax.core.errors import check_options, integer, number
+from radejax.core.errors import check_options, integer, number, require
 from radejax.core.structures import Array
 from radejax.data.projection import LOG_OFFSET_DB, LOG_SCALE_DB, POWER_FLOOR
 from radejax.geometry.radar_grid import RadarGrid
@@ -35,17 +35,31 @@ TESSERACT_OF_ROWS = (2, 0, 1, 3)
 """Permutation of the axes from rows `[R, E, D, A]` to a tesseract `[D, R, E, A]`."""
 
 
-_RANGES = {
+_DRAWN_RANGES = {
     "gain_db": number(-1e3, 1e3),
     "noise_db": number(-1e3, 1e3),
+    "receiver_db": number(-100, 100),
+    "range_profile": number(0, 2),
+    "high_pass_m": number(0, 1e3),
+    "leakage": number(0, 0.5),
+    "range_correlation": number(0, 4 / 9),
+    "beam_spread_db": number(0, 3),
+    "ground_clutter": number(0, 1),
+}
+_RANGES = _DRAWN_RANGES | {
+    "gain_doppler_bins": integer(0),
     "wavelength_m": number(1e-4, 1),
     "azimuth_elements": number(1, 512),
     "elevation_elements": number(1, 512),
     "array_pedestal": number(0, 1),
+    "doppler_pedestal": number(0, 1),
     "range_resolution_m": number(0, 100),
     "pattern_exponent": number(0, 100),
     "max_scatterers_per_row": integer(1, 4096),
 }
+
+DRAWN = frozenset(_DRAWN_RANGES)
+"""Fields of `RadarParameters` that can differ between sequences."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,39 +67,110 @@ class RadarParameters:
     """Parameters of the sensor other than its axes.
 
     Instances are hashable and can be static arguments of `jax.jit`. K-Radar publishes no
-    link budget. Gain and noise are set so that the noise lies near the middle of the
-    normalized scale of the tensor projection and a car at 5 m near its upper end.
+    link budget. The defaults are those of an ideal sensor. Gain and noise are set so that
+    the noise lies near the middle of the normalized scale of the tensor projection and a
+    car at 5 m near its upper end. `radejax.simulation.config.PRESETS` has other sensors.
 
     Attributes:
-        gain_db: Received power in dB from a target of 0 dBsm at 1 m on boresight.
+        gain_db: Received power in dB from a target of 0 dBsm at 1 m on boresight, without
+            the high-pass filter.
+        gain_doppler_bins: Number of Doppler bins for which the gain is given. Fewer bins
+            integrate fewer chirps, so the gain is less; 0 for the same gain of all numbers.
         noise_db: Mean noise power per cell in dB.
+        receiver_db: Gain of the receiver in dB, which amplifies echoes and noise.
+        range_profile: Factor on the profile over range in dB that K-Radar's noise has: the
+            direct leak into the first bins, a dip, a decay before the last bins and a rise
+            in them. 0 for noise of the same power at all ranges.
+        high_pass_m: Range below which the receiver's high-pass filter attenuates echoes by
+            40 dB per decade, as much as echoes become stronger; 0 for no filter.
+        leakage: Mean power of an echo in beams away from it, relative to its peak. It is
+            due to phase errors of the array's channels. 0 for an ideal array.
+        range_correlation: Correlation of the noise power in neighboring range bins. The
+            window of the range axis follows from it: 4/9 is a Hann window, less a higher
+            pedestal. 0 for a Hann window and independent noise.
+        beam_spread_db: Standard deviation over azimuth of the beams' gain in dB.
+        ground_clutter: Mean radar cross-section of the ground and roadside in m2 per m2,
+            whose many echoes have the statistics of noise.
         wavelength_m: Carrier wavelength, by default at 77 GHz.
         azimuth_elements: Number of elements of the virtual array in azimuth, at a spacing
             of half a wavelength.
         elevation_elements: Number of elements of the virtual array in elevation, at the
             same spacing.
         array_pedestal: Taper of the array, from 0 (Hann window) to 1 (uniform window).
+        doppler_pedestal: Window of the Doppler axis, likewise.
         range_resolution_m: Width of a range bin of the FFT, or 0 for the grid's bins.
         pattern_exponent: Exponent of the two-way antenna gain `cos(angle) ** exponent`.
         max_scatterers_per_row: Maximum number of scatterers summed in one range row.
             Only the strongest ones are summed.
+        ranges: Name, lowest and highest value of the fields of `DRAWN` of which each
+            sequence has its own value.
 
     Raises:
         UserError: A value is out of its range.
     """
 
     gain_db: float = 178.0
+    gain_doppler_bins: int = 0
     noise_db: float = 95.0
+    receiver_db: float = 0.0
+    range_profile: float = 0.0
+    high_pass_m: float = 0.0
+    leakage: float = 0.0
+    range_correlation: float = 0.0
+    beam_spread_db: float = 0.0
+    ground_clutter: float = 0.0
     wavelength_m: float = 0.0039
     azimuth_elements: float = 48.0
     elevation_elements: float = 16.0
     array_pedestal: float = 0.2
+    doppler_pedestal: float = 0.0
     range_resolution_m: float = 0.0
     pattern_exponent: float = 3.0
     max_scatterers_per_row: int = 96
+    ranges: tuple[tuple[str, float, float], ...] = ()
 
     def __post_init__(self) -> None:
-        check_options(vars(self), "config.simulation.radar", _RANGES)
+        section = "config.simulation.radar"
+        check_options(vars(self), section, _RANGES)
+        for name, low, high in self.ranges:
+            for end in (low, high):
+                check_options(vars(self) | {name: end}, section, _RANGES)
+            order = "the lower number first"
+            require(low <= high, f"{section}.{name}", (low, high), order)
+
+    def draw(self, rng: np.random.Generator, num_doppler: int) -> RadarParameters:
+        """Returns the parameters of one sequence for a number of Doppler bins.
+
+        They are drawn uniformly from their ranges.
+        """
+        drawn: dict[str, Any] = {
+            name: rng.uniform(low, high) for name, low, high in self.ranges
+        }
+        if self.gain_doppler_bins:
+            share = max(num_doppler, 1) / self.gain_doppler_bins
+            drawn["gain_db"] = drawn.get("gain_db", self.gain_db) + 10 * np.log10(share)
+        changes = {"ranges": (), "gain_doppler_bins": 0, **drawn}
+        return dataclasses.replace(self, **changes)
+
+
+class SensorState(struct.PyTreeNode):
+    """Imperfections of a sensor that last for a sequence, as a JAX pytree.
+
+    Attributes:
+        azimuth_phase_rad: Phase errors of one element of each pair of opposite elements of
+            the array in azimuth. The other one has the opposite error, which leaves the
+            response real and therefore needs no more computation than an ideal array.
+        elevation_phase_rad: The same of the array in elevation.
+        beam_gain: Gain of the amplitudes in each azimuth bin.
+        range_pedestal: Pedestal of the range window that echoes pass.
+        range_side: Amplitude of the two neighbors in the filter of the noise over range.
+    """
+
+    azimuth_phase_rad: Float[Array, " P"]
+    elevation_phase_rad: Float[Array, " Q"]
+    beam_gain: Float[Array, " A"]
+    range_pedestal: Float[Array, ""]
+    range_side: Float[Array, ""]
 
 
 class Scatterers(struct.PyTreeNode):
@@ -109,7 +194,9 @@ class Scatterers(struct.PyTreeNode):
 
 
 def window_response(
-    x: Float[Array, "*bins"], pedestal: float, num_samples: float = 0.0
+    x: Float[Array, "*bins"],
+    pedestal: float | Float[Array, ""],
+    num_samples: float = 0.0,
 ) -> Float[jax.Array, "*bins"]:
     """Computes the zero-phase transform of a raised cosine on a pedestal, 1 at its peak.
 
@@ -144,7 +231,7 @@ def window_response(
 
 
 def doppler_response(
-    velocity_mps: PerTarget, grid: RadarGrid
+    velocity_mps: PerTarget, grid: RadarGrid, pedestal: float = 0.0
 ) -> Float[jax.Array, "D S"]:
     """Computes amplitudes on the Doppler axis, where velocities alias by its period.
 
@@ -155,17 +242,20 @@ def doppler_response(
     step = float(grid.doppler_mps[1] - grid.doppler_mps[0])
     cell = (velocity_mps[None] - grid.doppler_mps[0]) / step
     offset = np.arange(grid.num_doppler, dtype=np.float32)[:, None] - cell
-    return window_response(offset, 0.0, float(grid.num_doppler))
+    return window_response(offset, pedestal, float(grid.num_doppler))
 
 
 def range_response(
-    range_m: PerTarget, grid: RadarGrid, parameters: RadarParameters
+    range_m: PerTarget,
+    grid: RadarGrid,
+    parameters: RadarParameters,
+    pedestal: float | Float[Array, ""] = 0.0,
 ) -> Float[jax.Array, "R S"]:
     """Computes amplitudes on the range axis."""
     resolution = parameters.range_resolution_m or grid.range_widths_m
     axis = grid.range_m.astype(np.float32)[:, None]
     offset = (axis - range_m[None]) / np.reshape(resolution, (-1, 1))
-    return window_response(offset, 0.0)
+    return window_response(offset, pedestal)
 
 
 @functools.partial(jax.jit, static_argnames=("grid", "parameters", "output"))
@@ -173,6 +263,7 @@ def simulate(
     scatterers: Scatterers,
     noise_power: Float[Array, "R D"],
     key: UInt32[Array, "2"],
+    state: SensorState | None = None,
     *,
     grid: RadarGrid,
     parameters: RadarParameters = RadarParameters(),
@@ -185,6 +276,7 @@ def simulate(
         noise_power: Mean power of the noise and of backscatter by weather, which has the
             same statistics.
         key: Random key of the noise of this frame.
+        state: Imperfections of the sensor, or None for an ideal sensor.
         grid: Axes of the tensor.
         parameters: Parameters of the sensor. One without elevation sees with a single beam
             at elevation 0.
@@ -201,10 +293,16 @@ def simulate(
     m, n = parameters.elevation_elements, parameters.azimuth_elements
     elevation_basis = array_basis(elevation_rad, m, pedestal)
     azimuth_basis = array_basis(grid.azimuth_rad, n, pedestal)
-    elevation = array_signal(scatterers.elevation_rad, m, pedestal)  # [M, S]
-    azimuth = array_signal(scatterers.azimuth_rad, n, pedestal)  # [N, S]
-    doppler = doppler_response(scatterers.velocity_mps, grid)  # [D, S]
-    in_range = range_response(scatterers.range_m, grid, parameters)  # [R, S]
+    up = None if state is None else state.elevation_phase_rad
+    across = None if state is None else state.azimuth_phase_rad
+    elevation = array_signal(scatterers.elevation_rad, m, pedestal, up)  # [M, S]
+    azimuth = array_signal(scatterers.azimuth_rad, n, pedestal, across)  # [N, S]
+    if state is not None:
+        azimuth_basis = azimuth_basis * state.beam_gain[:, None]
+    window = parameters.doppler_pedestal
+    doppler = doppler_response(scatterers.velocity_mps, grid, window)  # [D, S]
+    of_range = 0.0 if state is None else state.range_pedestal
+    in_range = range_response(scatterers.range_m, grid, parameters, of_range)  # [R, S]
     magnitude = jnp.linalg.norm(scatterers.amplitude, axis=-1)
     num_kept = min(parameters.max_scatterers_per_row, magnitude.shape[0])
     _, kept = lax.top_k(jnp.abs(in_range) * magnitude[None], num_kept)  # [R, K]
@@ -217,7 +315,10 @@ def simulate(
             [azimuth[:, index].T * amplitude[:, i : i + 1] for i in (0, 1)], axis=1
         )  # [K, 2 N]
         received = _product(left.reshape(-1, num_kept), right)
-        received += _noise(noise, key, row_idx, received.size).reshape(received.shape)
+        white = _white_noise(received.size, key, row_idx)
+        if state is not None:
+            white = _correlate(white, state.range_side, key, row_idx)
+        received += _noise(noise, white, window).reshape(received.shape)
         beams = _beams(received, elevation_basis, azimuth_basis)
         power = jnp.square(beams).sum(axis=2)  # [E, D, A]
         if output != "projection":
@@ -245,7 +346,7 @@ def array_basis(
     and the noise of two bins a and b has a correlation proportional to
     `sum_n w_n^2 cos(pi n (sin a - sin b))`.
     """
-    place, weight = _pairs(elements, pedestal)
+    place, weight = element_pairs(elements, pedestal)
     turn = np.pi * np.sin(axis_rad)[:, None] * place
     basis = np.concatenate(
         [weight * np.cos(turn), (weight * np.sin(turn))[:, place > 0]], axis=1
@@ -254,7 +355,10 @@ def array_basis(
 
 
 def array_signal(
-    angle_rad: PerTarget, elements: float, pedestal: float
+    angle_rad: PerTarget,
+    elements: float,
+    pedestal: float,
+    phase_rad: Float[Array, " P"] | None = None,
 ) -> Float[jax.Array, "N S"]:
     """Returns the signals of point targets at the inputs of `array_basis`.
 
@@ -262,17 +366,26 @@ def array_signal(
     `array_basis` and these signals is the pattern of the array with weights `w_n`. It
     depends on the difference of the sines of the angles, so beams widen away from
     boresight.
+
+    With phase errors, as in `SensorState`, a part of the power leaks into all beams. The
+    pattern of the leakage moves with the target. The amplitude at its angle remains 1.
     """
-    place, weight = _pairs(elements, pedestal)
+    place, weight = element_pairs(elements, pedestal)
     turn = jnp.pi * place.astype(np.float32)[:, None] * jnp.sin(angle_rad)[None]
+    if phase_rad is not None:
+        turn = turn + phase_rad[:, None]
     both = jnp.concatenate([jnp.cos(turn), jnp.sin(turn)[place > 0]])
-    pairs = np.where(place > 0, 1.0, np.sqrt(0.5))  # the middle element has no partner
-    gain = np.linalg.norm(weight) / np.sum(weight * pairs)
-    scale = np.concatenate([pairs, pairs[place > 0]]) * gain
-    return scale.astype(np.float32)[:, None] * both
+    count = np.where(place > 0, 1.0, np.sqrt(0.5))  # the middle element has no partner
+    gain = np.linalg.norm(weight) / np.sum(weight * count)
+    scale = np.concatenate([count, count[place > 0]]) * gain
+    signal = scale.astype(np.float32)[:, None] * both
+    if phase_rad is not None:
+        coherent = weight * count / np.sum(weight * count)
+        signal = signal / jnp.sum(coherent * jnp.cos(phase_rad))
+    return signal
 
 
-def _pairs(
+def element_pairs(
     elements: float, pedestal: float
 ) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, " P"]]:
     """Returns position in half wavelengths and weight of one element of each pair."""
@@ -301,22 +414,38 @@ _product = functools.partial(jnp.dot, precision=lax.Precision.HIGHEST)
 
 
 def _noise(
-    power: Float[jax.Array, " D"],
-    key: UInt32[Array, "2"],
-    row_idx: UInt32[jax.Array, ""],
-    count: int,
+    power: Float[jax.Array, " D"], white: Float[jax.Array, " count"], pedestal: float
 ) -> Float[jax.Array, "D columns"]:
-    """Generates the complex Gaussian noise of one range row at the inputs of the arrays.
+    """Computes the complex Gaussian noise of one range row at the inputs of the arrays.
 
-    White noise of every Doppler bin and pair of elements is filtered by the Hann window of
-    the Doppler axis (1/2, 1, 1/2 in bins) and scaled to the mean power of each bin.
+    White noise of every Doppler bin and pair of elements is filtered by the window of the
+    Doppler axis (1/2, 1, 1/2 in bins for a Hann window) and scaled to the mean power of
+    each bin.
     """
     num_doppler = power.shape[0]
+    if pedestal == 1.0:  # a uniform window has no neighbors
+        return jnp.sqrt(power)[:, None] * white.reshape(num_doppler, -1)
     one = np.eye(num_doppler, dtype=np.float32)
-    window = one + 0.5 * (np.roll(one, 1, axis=0) + np.roll(one, -1, axis=0))
+    side = 0.5 * (1.0 - pedestal) / (1.0 + pedestal)
+    window = one + side * (np.roll(one, 1, axis=0) + np.roll(one, -1, axis=0))
     window = window / np.linalg.norm(window, axis=1, keepdims=True)
-    white = _white_noise(count, key, row_idx)
     return (jnp.sqrt(power)[:, None] * window) @ white.reshape(num_doppler, -1)
+
+
+def _correlate(
+    white: Float[jax.Array, " count"],
+    side: Float[Array, ""],
+    key: UInt32[Array, "2"],
+    row_idx: UInt32[jax.Array, ""],
+) -> Float[jax.Array, " count"]:
+    """Filters the white noise of a range row by the window of the range axis.
+
+    The noise of the rows before and after it is generated again.
+    """
+    one = jnp.uint32(1)
+    before = _white_noise(white.size, key, row_idx - one)
+    after = _white_noise(white.size, key, row_idx + one)
+    return (white + side * (before + after)) * lax.rsqrt(1.0 + 2.0 * side**2)
 
 
 def _white_noise(
