@@ -195,9 +195,6 @@ def lifted_attention(
     reference = jnp.broadcast_to(reference, (b, *reference.shape[1:]))
     query_weights = jnp.broadcast_to(query_weights, (b, *query_weights.shape[1:]))
 
-    # This is not a loop over the samples: if the batch is split over devices, a loop would
-    # gather all of it on each of them.
-    @jax.vmap
     def sample(
         value: jax.Array, offsets: jax.Array, logits: jax.Array, *shared: jax.Array
     ) -> jax.Array:
@@ -208,7 +205,12 @@ def lifted_attention(
 
         return jax.lax.map(head, (value, offsets, logits, offset_bias, logit_bias))
 
-    return jnp.moveaxis(sample(value, *by_head, scale, reference, query_weights), 1, 2)
+    arrays = (value, *by_head, scale, reference, query_weights)
+    if b == 1:  # on a CPU, the gradient of a batch of one is slower
+        return jnp.moveaxis(sample(*(x[0] for x in arrays)), 0, 1)[None]
+    # This is not a loop over the samples: if the batch is split over devices, a loop would
+    # gather all of it on each of them.
+    return jnp.moveaxis(jax.vmap(sample)(*arrays), 1, 2)
 
 
 def _chunk_sizes(given: int, batch_size: Any) -> ChunkSizes:
