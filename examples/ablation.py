@@ -22,8 +22,9 @@ the tables of the finished runs. Several processes with the same command share t
 each its own core (`taskset -c 0 python ...`).
 
 AP is BEV at IoU 0.3 with the protocol `all_point`, averaged over the seeds. The 95 % intervals are
-from paired resamples of the held-out sequences. A claim is supported if the interval lies above 0
-and the difference reaches the claimed one, and contradicted if the interval ends below that.
+from paired resamples of the held-out sequences and do not count the variance between seeds. A claim
+is supported if the interval lies above 0 and the difference reaches the claimed one, and not
+reproduced if the interval ends below that. Both hold for simulated data only.
 """
 
 from __future__ import annotations
@@ -287,7 +288,7 @@ def verdict(difference: float, low: float, high: float, least: float = 0.0) -> s
     """Returns the verdict on the claim that a difference is positive and at least `least`."""
     if low > 0 and difference >= least:
         return "supported"
-    return "contradicted" if high < least or high < 0 else "inconclusive"
+    return "not reproduced" if high < least or high < 0 else "inconclusive"
 
 
 @dataclasses.dataclass

@@ -226,7 +226,7 @@ def points(
     """
     import tqdm
 
-    from radejax.data.kradar.dataset import read_grid
+    from radejax.data.kradar.dataset import is_elevation_axis_up, read_grid
     from radejax.data.points import read_points, write_points
     from radejax.data.records import PreprocessReport
     from radejax.inference.detect_files import find_frames, sequence_folder
@@ -242,12 +242,14 @@ def points(
                 "another --out, or roots of one form of radar data"
             )
         sources[target] = path
-    roots = {sequence_folder(path).parent for path in frames}
-    grid = read_grid(sorted({*map(pathlib.Path, paths), *roots}))
+    folders = {sequence_folder(path).parent for path in frames}
+    roots = sorted({*map(pathlib.Path, paths), *folders})
+    grid = read_grid(roots)
+    is_axis_up = is_elevation_axis_up(roots)
     began = time.perf_counter()
     for target, path in tqdm.tqdm(sources.items(), "points", unit="frame"):
         try:
-            cloud = read_points(path, grid, **options)
+            cloud = read_points(path, grid, is_axis_up=is_axis_up, **options)
         except (DataError, OSError) as error:
             skipped[str(path)] = str(error)
             continue

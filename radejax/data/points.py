@@ -114,7 +114,7 @@ POINT_FIELDS = (
     *("x", "y", "z", "power", "doppler", "range", "azimuth", "elevation"),
     *("range_bin", "azimuth_bin", "elevation_bin"),
 )
-"""Columns of points in files, in the units and signs of K-Radar's `rpc` files."""
+"""Columns of points in files, in the units of K-Radar's `rpc` files."""
 
 
 def read_points(
@@ -124,6 +124,7 @@ def read_points(
     *,
     rate: float = 0.01,
     threshold_db: float = 9.0,
+    is_axis_up: bool = False,
 ) -> Float[np.ndarray, "N 11"]:
     """Returns the points of a radar file, with the columns `POINT_FIELDS`.
 
@@ -134,6 +135,7 @@ def read_points(
             releases, or "cfar" for `cfar_points`.
         rate: Fraction of the cells that become points ("percentile").
         threshold_db: Minimum power above the mean of the training cells ("cfar").
+        is_axis_up: Whether the elevation axis points up, see `is_elevation_axis_up`.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -144,11 +146,12 @@ def read_points(
     require(method in ("percentile", "cfar"), "method", method, "percentile or cfar")
     if method == "percentile":
         require(0 < rate < 1, "rate", rate, "a number above 0 and below 1")
-        return strongest_points(read_polar(path, grid), grid, rate)
+        polar = read_polar(path, grid)
+        return strongest_points(polar, grid, rate, is_axis_up=is_axis_up)
     found = cfar_points(read_frame(path, grid), grid, threshold_db=threshold_db)
     power = 10 ** (found.power_db / 10) / POWER_UNIT
     bins = found.range_bin, found.azimuth_bin, found.elevation_bin
-    return points_of_bins(bins, power, found.doppler_mps, grid)
+    return points_of_bins(bins, power, found.doppler_mps, grid, is_axis_up=is_axis_up)
 
 
 def write_points(path: PathLike, points: Float[np.ndarray, "N 11"]) -> None:

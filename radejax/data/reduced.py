@@ -3,9 +3,9 @@
 - `polar3d_<radar>.npy` holds `[2, R, A, E]`: linear power, averaged over all Doppler bins
   but the first and divided by 1e13, and the power-weighted mean Doppler in m/s.
 - `rpc_<radar>.npy` holds the strongest cells of it as points `[N, 11]`: x, y, z, power,
-  mean Doppler, range, azimuth, elevation and the bins of the last three. Azimuth and
-  elevation are negated: positive to the left and upwards. Older files `[N, 5]` end after
-  the Doppler.
+  mean Doppler, range, azimuth, elevation and the bins of the last three. Azimuth is
+  positive to the left and elevation upwards, see `points_of_bins`. Older files `[N, 5]`
+  end after the Doppler.
 
 Both become projections `[R, A, D+E]` on the scale of `project_tensor`. A cell of mean power
 m (in the unit of the tensor) has the level (10 log10(m + 1e-10) + 1.2) / 184.3, where
@@ -180,7 +180,12 @@ def reduce_tensor(tesseract: Real[np.ndarray, "D R E A"], grid: RadarGrid) -> Po
 
 
 def strongest_points(
-    polar: Polar, grid: RadarGrid, rate: float, range_wise: bool = False
+    polar: Polar,
+    grid: RadarGrid,
+    rate: float,
+    range_wise: bool = False,
+    *,
+    is_axis_up: bool = False,
 ) -> Float[np.ndarray, "N 11"]:
     """Returns the points of an `rpc` file from a `polar3d` array.
 
@@ -190,11 +195,12 @@ def strongest_points(
         rate: Fraction of the cells that become points, above 0 and below 1.
         range_wise: Whether to take this fraction of the cells at every range, instead of
             all cells.
+        is_axis_up: See `points_of_bins`.
     """
     power, doppler = polar
     axes = (1, 2) if range_wise else None
     bins = np.nonzero(power > np.quantile(power, 1 - rate, axis=axes, keepdims=True))
-    return points_of_bins(bins, power[bins], doppler[bins], grid)
+    return points_of_bins(bins, power[bins], doppler[bins], grid, is_axis_up=is_axis_up)
 
 
 def to_polar(frame: Real[np.ndarray, "..."], grid: RadarGrid, name: str) -> Polar:
@@ -225,6 +231,8 @@ def points_of_bins(
     power: Float[np.ndarray, " N"],
     doppler_mps: Float[np.ndarray, " N"],
     grid: RadarGrid,
+    *,
+    is_axis_up: bool = False,
 ) -> Float[np.ndarray, "N 11"]:
     """Returns points in the columns of an `rpc` file.
 
@@ -233,17 +241,21 @@ def points_of_bins(
         power: Power in `POWER_UNIT`.
         doppler_mps: Doppler velocity.
         grid: Axes of the radar. Without elevation bins, the elevation is 0.
+        is_axis_up: Whether the elevation axis points up, as in simulated data. K-Radar's
+            code takes that of its tensors to point down and negates it.
     """
-    x, y, z, *angles = _points_at(bins, grid)
+    x, y, z, *angles = _points_at(bins, grid, is_axis_up)
     return np.stack([x, y, z, power, doppler_mps, *angles, *bins], axis=1)
 
 
-def _points_at(bins: Any, grid: RadarGrid) -> Float[np.ndarray, "6 N"]:
+def _points_at(
+    bins: Any, grid: RadarGrid, is_axis_up: bool = False
+) -> Float[np.ndarray, "6 N"]:
     """Returns x, y, z, range, azimuth and elevation of bins, in the signs of points."""
     r = grid.range_m[bins[0]]
     azimuth, elevation = -grid.azimuth_rad[bins[1]], np.zeros(r.shape)
     if grid.num_elevation:
-        elevation = -grid.elevation_rad[bins[2]]
+        elevation = grid.elevation_rad[bins[2]] * (1 if is_axis_up else -1)
     ground = r * np.cos(elevation)
     xyz = ground * np.cos(azimuth), ground * np.sin(azimuth), r * np.sin(elevation)
     return np.stack([*xyz, r, azimuth, elevation])
@@ -265,7 +277,9 @@ def _bins_of_points(
         stored = np.rint(places)
     # NaN becomes bin 0. Then, as for bins outside the grid, the position is another one.
     bins = np.nan_to_num(np.clip(stored, 0, sizes - 1)).astype(np.intp)
-    is_far = ~(np.abs(_points_at(bins, grid)[:3] - xyz) <= np.diff(axes[0]).min() / 2)
+    expected = _points_at(bins, grid)[:3]
+    expected[2] = np.copysign(expected[2], z)  # the axis may point up or down
+    is_far = ~(np.abs(expected - xyz) <= np.diff(axes[0]).min() / 2)
     if (is_wrong := is_far.any(axis=0) | (bins != stored).any(axis=0)).any():
         row = int(is_wrong.argmax())
         raise DataError(

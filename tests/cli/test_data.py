@@ -213,10 +213,14 @@ def test_points_of_two_disks(
     _run("points", tensors, "--rate", 0.1, "--out", expected)
     paths = sorted(expected.glob("*/rpc_*.npy"))
     assert len(paths) == 12
+    grid = KRadar(tensors).grid
     for path in paths:
         found = np.load(tmp_path / "found" / path.relative_to(expected))
         np.testing.assert_array_equal(found, np.load(path))
         assert found.shape[1] == 11
+        # The elevation axis of simulated tensors points up.
+        elevation_rad = grid.elevation_rad[found[:, 10].astype(int)]
+        np.testing.assert_allclose(found[:, 2], found[:, 5] * np.sin(elevation_rad))
     again = _run("points", radar, others, tensors, *words, code=2).output
     assert again.startswith("error: ")
     assert "would both be" in again

@@ -14,7 +14,12 @@ from radejax.data.points import (
     write_points,
 )
 from radejax.data.projection import project_tensor
-from radejax.data.reduced import points_of_bins, reduce_tensor, strongest_points
+from radejax.data.reduced import (
+    points_of_bins,
+    project_reduced,
+    reduce_tensor,
+    strongest_points,
+)
 from radejax.geometry.radar_grid import RadarGrid
 
 from .. import small_models as small
@@ -168,6 +173,24 @@ def test_cfar_finds_the_echo_in_every_form(tmp_path, form):
     # The mean over 7 Doppler bins, of which one has the echo.
     divisor = 7 if form in ("polar3d", "rpc") else 1
     assert point[3] == pytest.approx(1 / divisor, rel=0.01)
+
+
+@pytest.mark.parametrize("method", ["percentile", "cfar"])
+@pytest.mark.parametrize("form", ["tesseract", "polar3d", "rpc"])
+def test_z_is_that_of_an_axis_that_points_up_or_down(tmp_path, form, method):
+    path = radar_file(tmp_path, form, noise_with_echo())
+    options = {"rate": 5e-5, "threshold_db": 25.0}
+    (up,) = read_points(path, GRID, method, is_axis_up=True, **options)
+    (down,) = read_points(path, GRID, method, **options)
+    # The echo is in the last elevation bin, at 18 degrees.
+    z_m = GRID.range_m[30] * np.sin(np.deg2rad(18.0))
+    np.testing.assert_allclose(up[[2, 7]], [z_m, np.deg2rad(18.0)])
+    np.testing.assert_allclose(down[[2, 7]], -up[[2, 7]])
+    others = [0, 1, 3, 4, 5, 6, 8, 9, 10]
+    np.testing.assert_array_equal(up[others], down[others])
+    # Both are read as points of the same bin.
+    expected = project_reduced(down[None], GRID)
+    np.testing.assert_array_equal(project_reduced(up[None], GRID), expected)
 
 
 def test_projections_have_no_mean_power(tmp_path):

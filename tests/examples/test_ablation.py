@@ -156,10 +156,10 @@ def test_splits_of_the_last_frames(
     [
         ((5.0, 1.0, 9.0, 0.0), "supported"),
         ((5.0, -1.0, 9.0, 0.0), "inconclusive"),
-        ((-5.0, -9.0, -1.0, 0.0), "contradicted"),
+        ((-5.0, -9.0, -1.0, 0.0), "not reproduced"),
         ((3.0, 1.0, 5.0, 4.0), "inconclusive"),
         ((5.0, 1.0, 9.0, 4.0), "supported"),
-        ((2.0, 1.0, 3.0, 4.0), "contradicted"),
+        ((2.0, 1.0, 3.0, 4.0), "not reproduced"),
     ],
 )
 def test_verdicts(numbers: tuple[float, ...], word: str) -> None:

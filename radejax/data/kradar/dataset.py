@@ -657,6 +657,19 @@ def read_grid(roots: Sequence[pathlib.Path]) -> RadarGrid:
     return grid or RadarGrid.kradar()
 
 
+def is_elevation_axis_up(roots: Sequence[pathlib.Path]) -> bool:
+    """Returns whether the elevation axis of the radar tensors in the roots points up.
+
+    That of simulated datasets and of other radars does. K-Radar's code takes the axis of
+    K-Radar's own tensors to point down.
+
+    Raises:
+        DataError: A `radar_grid.json` is malformed, or the roots have different ones.
+    """
+    is_simulated = any((root / SIMULATION_MARKER).is_file() for root in roots)
+    return is_simulated or read_grid(roots) != RadarGrid.kradar()
+
+
 # Label files -------------------------------------------------------------------------
 
 

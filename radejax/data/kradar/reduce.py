@@ -14,7 +14,12 @@ from tqdm import tqdm
 from radejax.core.archives import read_npy
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import PathLike, as_path, atomic_write
-from radejax.data.kradar.dataset import find_release, find_sequences, read_grid
+from radejax.data.kradar.dataset import (
+    find_release,
+    find_sequences,
+    is_elevation_axis_up,
+    read_grid,
+)
 from radejax.data.records import PreprocessReport
 from radejax.data.reduced import polar_shape, strongest_points
 from radejax.data.tesseract import check_axes, read_polar
@@ -65,6 +70,7 @@ def reduce_dataset(
         require(is_same, "rate", rate, f"about {found:.3g}, as of the points in {out}")
     for root in paths:
         shutil.copytree(root, out, False, _LEFT_OUT, _link, dirs_exist_ok=True)
+    is_axis_up = is_elevation_axis_up(paths)
     skipped = {}
     for path in tqdm(missing, "reduce", unit="frame"):
         try:
@@ -73,7 +79,7 @@ def reduce_dataset(
             skipped[str(path)] = str(error)
             continue
         if release == "rpc":
-            frame = strongest_points(frame, grid, rate)
+            frame = strongest_points(frame, grid, rate, is_axis_up=is_axis_up)
         with atomic_write(targets[path]) as file:
             np.save(file, frame)
     num_found, seconds = len(targets) - len(missing), time.perf_counter() - began

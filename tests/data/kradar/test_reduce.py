@@ -9,6 +9,7 @@ import pytest
 from radejax.core.errors import UserError
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.check import check_dataset
+from radejax.data.kradar.dataset import SIMULATION_MARKER, is_elevation_axis_up
 from radejax.data.kradar.reduce import reduce_dataset
 from radejax.data.records import Records, open_projections, preprocess
 from radejax.data.reduced import project_reduced, reduce_tensor, strongest_points
@@ -34,7 +35,7 @@ def test_frames_are_those_of_the_tensors(kradar_root, tmp_path, release):
         assert frame.weather == full.weather == "fog"
         polar = reduce_tensor(read_tesseract(full.tesseract_path), data.grid)
         if release == "rpc":
-            polar = strongest_points(polar, data.grid, 0.2)
+            polar = strongest_points(polar, data.grid, 0.2, is_axis_up=True)
         assert frame.radar_path == root / str(frame.sequence) / (
             f"{release}_{frame.header.radar:05d}.npy"
         )
@@ -44,6 +45,13 @@ def test_frames_are_those_of_the_tensors(kradar_root, tmp_path, release):
         np.testing.assert_array_equal(
             frame.read_projection(data.grid), project_reduced(polar, data.grid)
         )
+
+
+def test_the_elevation_axis_points_up_except_in_kradar(kradar_root, tmp_path):
+    assert is_elevation_axis_up([kradar_root])  # with a grid of its own
+    assert not is_elevation_axis_up([tmp_path])
+    (tmp_path / SIMULATION_MARKER).touch()
+    assert is_elevation_axis_up([tmp_path])
 
 
 def test_writing_resumes_and_lists_corrupted_tensors(kradar_root, tmp_path):
