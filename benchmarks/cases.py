@@ -9,6 +9,7 @@ import functools
 import importlib.util
 import itertools
 import pathlib
+import statistics
 import tempfile
 
 import inputs
@@ -111,7 +112,7 @@ def evaluate(machine):
 
 
 def load(machine):
-    """Loading of records as host batches of 8, compared with the released `.npy` files."""
+    """Loading of host batches of 8: records, and frames per second by number of threads."""
     size, count = 8, 128
     with contextlib.ExitStack() as stack:
         columns = {}
@@ -130,6 +131,41 @@ def load(machine):
             timed, lambda: inputs.read_npy(paths, size, count)
         )
         yield Case(name="records to batches", columns=columns, frames=count)
+    with (
+        inputs.folder_of_records(32, GRID, "float16") as source,
+        inputs.front_images(32) as images,
+    ):
+        frames = inputs.labelled(source)
+        for name, given, count in (("radar", None, 128), ("camera", images, 32)):
+            table = make_table(source, frames, max_objects=32, images=given)
+            for num_threads in inputs.thread_counts():
+                options = LoaderOptions(size, num_threads=num_threads)
+                column, note = reading(
+                    make_loader(table, options), count // size, count
+                )
+                yield Case(
+                    name=f"{name} frames to batches, threads: {num_threads}",
+                    columns={"radejax": column},
+                    frames=count,
+                    dtype=source.dtype,
+                    note=note,
+                )
+
+
+def reading(batches, num_batches, num_frames):
+    """Returns a column that takes batches, and a note with frames per second."""
+    walls = []
+
+    def column():
+        taken = itertools.islice(batches, num_batches)
+        wall, processor = timed(lambda: collections.deque(taken, maxlen=1))
+        walls.append(wall)
+        return wall, processor
+
+    def note():
+        return f"{num_frames / statistics.median(walls[1:]):.0f} frames/s"
+
+    return column, note
 
 
 def simulate(machine):

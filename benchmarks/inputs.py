@@ -6,6 +6,7 @@ Sizes are those of K-Radar. Values are random where they do not affect the time.
 import contextlib
 import functools
 import itertools
+import pathlib
 import tempfile
 import types
 
@@ -13,9 +14,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import shapely
+from PIL import Image
 
 from radejax.core.structures import CLASSES, Batch, DetectionMaps
+from radejax.core.workers import usable_cpus
+from radejax.data.cameras import CameraOptions
 from radejax.data.kradar.conditions import WEATHERS
+from radejax.data.pipeline import CameraInputs
 from radejax.data.projection import encode
 from radejax.data.records import Records
 from radejax.detection.decode import decode
@@ -100,6 +105,32 @@ def folder_of_records(count, grid, dtype):
         for k in range(count):
             records.write(f"1/{k:05d}", encode(levels, dtype))
         yield records
+
+
+@contextlib.contextmanager
+def front_images(count):
+    """Context manager of camera inputs: four stereo images of 2.5 MB, used in turn."""
+    rng = np.random.default_rng(0)
+    v, u = np.mgrid[:720, :2560]
+    scene = 100 + 50 * np.sin(u / 200) + 40 * np.cos(v / 150)
+    with tempfile.TemporaryDirectory() as folder:
+        paths = [pathlib.Path(folder) / f"cam-front_{i:05d}.png" for i in range(4)]
+        for path in paths:
+            noisy = scene[..., None] + rng.normal(0, 2, (720, 2560, 3))
+            Image.fromarray(noisy.astype(np.uint8)).save(path)
+        yield CameraInputs(
+            cameras=(CALIBRATION.camera(),) * count,
+            image_size=(720, 1280),
+            options=CameraOptions(),
+            features=None,
+            sources=[paths[i % len(paths)] for i in range(count)],
+            calibrated_sizes=[(720, 1280)] * count,
+        )
+
+
+def thread_counts():
+    """Returns 1, 2 and the number of usable CPUs, each once."""
+    return sorted({1, 2, usable_cpus()})
 
 
 def labelled(records):

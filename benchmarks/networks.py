@@ -195,36 +195,45 @@ def radenet_training(machine):
 
 
 def feeding(machine):
-    """Training steps of RADE-Net with batches from the loader."""
+    """Training steps of RADE-Net with batches from the loader, by number of threads."""
     dtype, size = ("float32", 1) if machine["platform"] == "cpu" else ("bfloat16", 8)
     config, model, precision = network("radenet.py", dtype)
     with inputs.folder_of_records(32, GRID, "float16") as records:
         table = make_table(records, inputs.labelled(records), max_objects=8)
-        batches = make_loader(table, LoaderOptions(size))
-        first = next(batches)
+        first = next(make_loader(table, LoaderOptions(size)))
         variables = random_variables(model, np.asarray(first.projection))
         step, cost = step_of(config, model, variables, first, precision)
-        spent = []
+        # On a CPU, steps take so long that one thread is enough.
+        counts = inputs.thread_counts()
+        for num_threads in counts[:1] if machine["platform"] == "cpu" else counts:
+            batches = make_loader(table, LoaderOptions(size, num_threads=num_threads))
+            column, note = fed(step, batches)
+            yield Case(
+                name=f"RADE-Net, training step fed by the loader, threads: {num_threads}",
+                columns={"radejax": column},
+                frames=size,
+                dtype=dtype,
+                note=note,
+                **cost,
+            )
 
-        def run():
-            began = time.perf_counter()
-            batch = next(batches)
-            spent.append((time.perf_counter() - began, began))
-            step(jax.device_put(batch))
-            spent[-1] = spent[-1][0], time.perf_counter() - began
 
-        def note():
-            waits, walls = zip(*spent[1:], strict=True)  # the first fills the queue
-            return f"waits for data: {sum(waits) / sum(walls):.2%}"
+def fed(step, batches):
+    """Returns a column that trains on a batch, and a note with the share of waiting."""
+    spent = []
 
-        yield Case(
-            name="RADE-Net, training step fed by the loader",
-            columns={"radejax": functools.partial(timed, run)},
-            frames=size,
-            dtype=dtype,
-            note=note,
-            **cost,
-        )
+    def run():
+        began = time.perf_counter()
+        batch = next(batches)
+        spent.append((time.perf_counter() - began, began))
+        step(jax.device_put(batch))
+        spent[-1] = spent[-1][0], time.perf_counter() - began
+
+    def note():
+        waits, walls = zip(*spent[1:], strict=True)  # the first fills the queue
+        return f"waits for data: {sum(waits) / sum(walls):.2%}"
+
+    return functools.partial(timed, run), note
 
 
 def dinorade(machine, task="forward"):

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from radejax.core.structures import Batch
+from radejax.core.workers import usable_cpus
 from radejax.geometry.boxes import boxes8_from_7
 from radejax.simulation.config import SimulationConfig
 from radejax.simulation.radar import tensor
@@ -34,7 +35,7 @@ class OnlineBatches:
         batch_size: Number of frames per batch.
         max_objects: Number of rows for boxes, N of `Batch`. The nearest objects are kept.
         seed: Seed of the choice of frames and of their noise. Scenes use the config's seed.
-        num_threads: Number of threads that compute scatterers.
+        num_threads: Number of threads that compute scatterers, or None for one per CPU.
         start_step: Step of the first batch; to resume, the step that was reached.
 
     Attributes:
@@ -50,7 +51,7 @@ class OnlineBatches:
         batch_size: int,
         max_objects: int,
         seed: int = 0,
-        num_threads: int = 2,
+        num_threads: int | None = None,
         start_step: int = 0,
     ) -> None:
         self._config = SimulationConfig.from_mapping(config)
@@ -66,7 +67,8 @@ class OnlineBatches:
         self._batch_size, self._max_objects = batch_size, max_objects
         self._seed = seed
         self.step, self.num_cut = start_step, 0
-        self._pool = concurrent.futures.ThreadPoolExecutor(max(num_threads, 1))
+        count = usable_cpus() if num_threads is None else max(num_threads, 1)
+        self._pool = concurrent.futures.ThreadPoolExecutor(count)
         self._lock = threading.Lock()
         self._simulator = functools.lru_cache(_CACHED_SEQUENCES)(self._make_simulator)
 

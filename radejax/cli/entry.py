@@ -339,5 +339,5 @@ workers = click.option(
     "--workers",
     "num_workers",
     type=COUNT,
-    help="Number of processes. Default: one per core.",
+    help="Number of processes. Default: as many as CPUs and memory allow.",
 )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 from typing import Any
 
 import click
@@ -150,4 +149,3 @@ def join_processes(
         ) from error
     if jax.process_index():
         logging.getLogger("radejax").setLevel(logging.ERROR)
-        os.environ["TQDM_DISABLE"] = "1"  # read when tqdm is imported

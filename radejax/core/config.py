@@ -359,8 +359,9 @@ _FIELDS: dict[str, Any] = {
         "max_objects": 32,
         # Mapping of azimuth bins to angles: true, or stretched for official checkpoints.
         "azimuth_mapping": "true",
-        # Number of threads that prepare batches; 0: the main thread prepares them.
-        "num_threads": 2,
+        # Number of threads that read frames; None: one per CPU that the process may use;
+        # 0: the main thread reads them.
+        "num_threads": placeholder(int),
         # Probability of mirroring a frame left to right, from 0 to 1.
         "mirror_probability": 0.0,
         # Sanity check: shuffles the labels of the training frames with this seed.

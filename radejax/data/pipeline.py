@@ -7,7 +7,9 @@ one number.
 
 from __future__ import annotations
 
+import concurrent.futures
 import dataclasses
+import functools
 import logging
 import re
 from collections.abc import Iterable, Sequence
@@ -20,6 +22,7 @@ from jaxtyping import Float, Int, Real
 
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES, Batch
+from radejax.core.workers import usable_cpus
 from radejax.data.augment import Augmentation
 from radejax.data.cameras import CameraOptions, no_camera, read_left_image
 from radejax.data.dataset import FrameSequence, LabelledFrame
@@ -335,8 +338,8 @@ class LoaderOptions:
         pad_remainder: Whether to fill the last, smaller batch of an epoch with empty
             frames of index -1 instead, so that all processes have the same number of
             batches.
-        num_threads: Number of threads that prepare batches; 0 prepares them in the
-            calling thread.
+        num_threads: Number of threads that read frames, or None for one per CPU that
+            the process may use; 0 reads them in the calling thread.
         process_index: Index of this process, or None for that of JAX.
         process_count: Number of processes, or None for that of JAX.
     """
@@ -347,7 +350,7 @@ class LoaderOptions:
     num_epochs: int | None = None
     drop_remainder: bool = True
     pad_remainder: bool = False
-    num_threads: int = 2
+    num_threads: int | None = None
     process_index: int | None = None
     process_count: int | None = None
 
@@ -377,13 +380,18 @@ def make_loader(
         UserError: There are fewer frames than one batch of all processes, and the
             remainder is dropped and not padded.
     """
-    threads = grain.ReadOptions(
-        num_threads=options.num_threads,
-        prefetch_buffer_size=max(2, options.num_threads),
+    num_threads = options.num_threads
+    if num_threads is None:
+        num_threads = usable_cpus()
+    # As few batches at a time as keep all threads busy, for the sake of memory.
+    num_batches = max(2, -(-num_threads // options.batch_size)) if num_threads else 0
+    reading = grain.ReadOptions(
+        num_threads=num_batches, prefetch_buffer_size=num_batches
     )
     order = _make_order(len(table), options).repeat(options.num_epochs)
-    batches: grain.MapDataset[Batch] = order.map(_LoadBatch(table, augment))
-    return iter(batches.to_iter_dataset(threads))
+    load: Any = _LoadBatch(table, augment, num_threads)
+    batches: grain.MapDataset[Batch] = order.map(load)
+    return iter(batches.to_iter_dataset(reading))
 
 
 def check_enough(num_frames: int, batch_size: int, count: int = 1) -> None:
@@ -440,33 +448,44 @@ def _add_seed(frame: int, rng: np.random.Generator) -> Int[np.ndarray, "2"]:
 
 
 class _LoadBatch(grain.transforms.Map):
-    """Reads the frames of a batch directly into the arrays of the batch."""
+    """Reads the frames of a batch in parallel, directly into the arrays of the batch."""
 
-    def __init__(self, table: FrameTable, augment: Augmentation | None) -> None:
+    def __init__(
+        self, table: FrameTable, augment: Augmentation | None, num_threads: int
+    ) -> None:
         self._table, self._augment = table, augment
+        self._map: Any = map
+        if num_threads:
+            self._map = concurrent.futures.ThreadPoolExecutor(num_threads).map
 
     def __repr__(self) -> str:
         return "_LoadBatch()"
 
     def map(self, element: Int[np.ndarray, "B 2"]) -> Batch:
-        images = self._table.images
         batch = self._empty(len(element))
-        cameras = [no_camera(images.image_size)] * len(element) if images else []
-        for row, (index, seed) in enumerate(element.tolist()):
-            if index >= len(self._table):
-                continue
-            sample = self._sample(index)
-            if self._augment is not None:
-                sample = self._augment(sample, np.random.default_rng(seed))
-            batch.projection[row] = sample["projection"]
-            batch.boxes[row] = sample["boxes"]
-            batch.classes[row] = self._table.classes[index]
-            batch.is_valid[row] = batch.classes[row] >= 0
-            batch.frame[row] = index
-            if batch.image is not None:
-                batch.image[row] = sample["image"]
-                cameras[row] = sample["camera"]
-        return batch.replace(camera=stack_cameras(cameras)) if images else batch
+        fill = functools.partial(self._fill, batch)
+        indices, seeds = element.T.tolist()
+        cameras = list(self._map(fill, range(len(element)), indices, seeds))
+        if self._table.images is None:
+            return batch
+        return batch.replace(camera=stack_cameras(cameras))
+
+    def _fill(self, batch: Batch, row: int, index: int, seed: int) -> Camera | None:
+        """Reads one frame into a row of a batch; returns its camera, if there are any."""
+        images = self._table.images
+        if index >= len(self._table):  # the row is padding and stays empty
+            return None if images is None else no_camera(images.image_size)
+        sample = self._sample(index)
+        if self._augment is not None:
+            sample = self._augment(sample, np.random.default_rng(seed))
+        batch.projection[row] = sample["projection"]
+        batch.boxes[row] = sample["boxes"]
+        batch.classes[row] = self._table.classes[index]
+        batch.is_valid[row] = batch.classes[row] >= 0
+        batch.frame[row] = index
+        if batch.image is not None:
+            batch.image[row] = sample["image"]
+        return sample["camera"]
 
     def _sample(self, index: int) -> dict[str, Any]:
         """Returns one frame; image and camera are None for radar-only models."""

@@ -16,7 +16,6 @@ import itertools
 import json
 import logging
 import math
-import os
 import pathlib
 import time
 from collections.abc import Generator, Mapping, Sequence
@@ -29,7 +28,7 @@ from tqdm import tqdm
 from radejax.core import files
 from radejax.core.archives import wrap_read_errors
 from radejax.core.errors import DataError, UserError, require
-from radejax.core.workers import process_pool
+from radejax.core.workers import default_workers, process_pool
 from radejax.data.dataset import FrameSequence, LabelledFrame, LabelledFrames
 from radejax.data.projection import ENCODINGS, decode, encode
 from radejax.geometry.radar_grid import RadarGrid, is_uniform
@@ -310,8 +309,8 @@ def preprocess(
             or "float16" without any.
         shard: `(i, n)` selects every n-th frame starting with frame i, counted from 0.
         num_workers: Number of worker processes; 0 works in the calling process. None
-            starts one per core, or none for small jobs that would end before the
-            workers have started.
+            starts as many as CPUs and memory allow, or none for small jobs that would
+            end before the workers have started.
         progress: Whether to show a progress bar.
 
     Raises:
@@ -338,7 +337,7 @@ def preprocess(
     missing = [frame for frame in mine if frame.key not in keys]
     if num_workers is None:
         is_small = len(missing) * math.prod(grid.shape_drea) < _SMALL_JOB_BINS
-        num_workers = 0 if is_small else os.cpu_count() or 1
+        num_workers = 0 if is_small else default_workers()
     with contextlib.closing(_write_all(records, missing, num_workers)) as results:
         is_hidden = not (progress and missing)
         bar = tqdm(results, "preprocess", len(missing), unit="frame", disable=is_hidden)

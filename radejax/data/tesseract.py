@@ -87,10 +87,22 @@ def project_file(
         else:
             tensor = _read_array(file, layout)
             lowest, projection = float(tensor[..., 0].min()), project_tensor(tensor)
-    beams = projection[..., layout.shape[0] :].max(axis=0)
-    if problem := find_problem(beams, lowest):
-        raise DataError(f"{path}: corrupted, {VARIABLE} is not linear power: {problem}")
+    _check_power(path, projection[..., layout.shape[0] :], lowest)
     return projection
+
+
+def _check_power(
+    path: PathLike, elevations: Float[np.ndarray, "R A E"], lowest: float
+) -> None:
+    """Raise a `DataError` if values cannot be power.
+
+    Args:
+        path: File of the radar tensor, for the message.
+        elevations: Elevation channels of its projection.
+        lowest: Smallest value of its first azimuth.
+    """
+    if problem := find_problem(elevations.max(axis=0), lowest):
+        raise DataError(f"{path}: corrupted, {VARIABLE} is not linear power: {problem}")
 
 
 def read_projection_npy(
@@ -191,8 +203,10 @@ def read_polar(path: PathLike, grid: RadarGrid) -> Polar:
             f"{path}: a projection, which has no mean power of cells; expected a radar "
             "tensor, polar3d or rpc file"
         )
-    project_file(path, shape_drea=grid.shape_drea)  # checks the values
-    return reduce_tensor(read_tesseract(path), grid)
+    tensor = read_tesseract(path, shape_drea=grid.shape_drea)
+    elevations = project_tensor(tensor)[..., grid.num_doppler :]
+    _check_power(path, elevations, float(tensor[..., 0].min()))
+    return reduce_tensor(tensor, grid)
 
 
 def check_frame(path: PathLike, grid: RadarGrid, *, deep: bool = False) -> None:

@@ -463,10 +463,22 @@ class Detector:
         """
         if not isinstance(x, np.ndarray):
             return jax.device_put(x, self.sharding)
+        if not x.flags.c_contiguous and _reversed(x).flags.c_contiguous:
+            # Frames of column-major tensors, such as `scipy.io.loadmat` returns, are copied
+            # as they are stored: the device reorders them faster than the host.
+            return _reverse(self.put(_reversed(x)))
         is_cpu = jax.default_backend() == "cpu"
         x = x.copy() if is_cpu else x
         placed = jax.make_array_from_process_local_data(self.sharding, x)
         return placed if is_cpu else jax.block_until_ready(placed)
+
+
+def _reversed(x: Shaped[Any, "B ..."]) -> Shaped[Any, "B ..."]:
+    """Reverse the order of all axes but the first."""
+    return x.transpose(0, *range(x.ndim - 1, 0, -1))
+
+
+_reverse = jax.jit(_reversed)
 
 
 def _padded(x: Shaped[Array, "b ..."], size: int) -> Shaped[Array, "{size} ..."]:

@@ -56,7 +56,7 @@ _DATA = {
     "num_frames": integer(1),
     "max_objects": integer(1),
     "azimuth_mapping": one_of("true", "stretched"),
-    "num_threads": integer(0),
+    "num_threads": or_none(integer(0)),
     "mirror_probability": number(0, 1),
     "label_permutation_seed": or_none(integer(0)),
 }

@@ -27,7 +27,7 @@ from tqdm import tqdm
 
 from radejax.core import files
 from radejax.core.errors import UserError
-from radejax.core.workers import process_pool
+from radejax.core.workers import default_workers, process_pool
 from radejax.data.kradar import write as kradar_write
 from radejax.data.kradar.dataset import SIMULATION_MARKER
 from radejax.data.kradar.labels import Label
@@ -67,7 +67,8 @@ def simulate_dataset(
         config: Mapping or ConfigDict of plain values, as returned by `default_config`.
         root: Folder of the dataset, which is created if it does not exist.
         num_workers: Number of processes that create scenes and render images. 0 uses only
-            this process. None uses one per core, or only this process for few frames.
+            this process. None uses as many as CPUs and memory allow, or only this process
+            for few frames.
         progress: Whether to show a progress bar.
 
     Returns:
@@ -171,7 +172,8 @@ class Writer:
         missing = list(self._missing())
         total = sum(len(self.source.frames(n)) for n in self.source.numbers)
         if num_workers is None:
-            num_workers = (os.cpu_count() or 1) if len(missing) > _FEW_FRAMES else 0
+            is_small = len(missing) <= _FEW_FRAMES
+            num_workers = 0 if is_small else default_workers()
         compute = functools.partial(
             tensor.simulate,
             grid=self.grid,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import logging
 import pathlib
 import time
 from collections.abc import Mapping
@@ -19,7 +20,10 @@ from ml_collections import ConfigDict
 
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
+from radejax.core.workers import usable_cpus
 from radejax.training import distributed
+
+_log = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,6 +72,8 @@ class MetricLogger:
         self._path = folder / "metrics.jsonl"
         self._frames_per_step = config.train.batch_size
         self._losses = tuple(config.loss.weights)
+        self._num_threads = config.data.num_threads
+        self._has_warned = False
         self._board, self._wandb = None, None
         if is_main:
             if self._path.exists():
@@ -136,9 +142,26 @@ class MetricLogger:
             values["frames_per_s"] = steps * self._frames_per_step / elapsed
             values["data_wait_share"] = self._waited / elapsed
             text.append(f"{values['frames_per_s']:.1f} frames/s")
+            self._warn_of_waiting(values["data_wait_share"])
         self._restart_timer(step)
         self._bar.set_postfix_str(" ".join(text))
         self._write(step, {**values, "epoch": epoch}, {})
+
+    def _warn_of_waiting(self, share: float) -> None:
+        """Warns once if training waits for data for more than a fifth of its time."""
+        if share <= 0.2 or self._has_warned:
+            return
+        self._has_warned = True
+        num_cpus = usable_cpus()
+        num_threads = num_cpus if self._num_threads is None else self._num_threads
+        _log.warning(
+            "training waits for data for %.0f %% of its time: raise "
+            "config.data.num_threads (%d threads read frames, on %d CPUs), or put the "
+            "records and images on a faster disk",
+            100 * share,
+            num_threads,
+            num_cpus,
+        )
 
     def log_scores(self, step: int, scores: Scores) -> None:
         """Writes the result of an evaluation, and leaves its duration out of the rate."""

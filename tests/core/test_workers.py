@@ -1,4 +1,4 @@
-"""Worker processes: their start, Ctrl-C, and ends that are not their own."""
+"""Worker processes: their number, their start, Ctrl-C, and ends that are not their own."""
 
 import os
 import pathlib
@@ -9,8 +9,9 @@ import time
 
 import pytest
 
+from radejax.core import workers
 from radejax.core.errors import DataError, UserError
-from radejax.core.workers import process_pool
+from radejax.core.workers import default_workers, process_pool, usable_cpus
 
 
 def is_running(pid):
@@ -28,6 +29,36 @@ def test_a_worker_is_started_once_leaves_ctrl_c_alone_and_ends(tmp_path):
         assert submit(os.getpid).result() == pid != os.getpid()
         assert submit(pathlib.Path.cwd).result() == tmp_path
     assert not is_running(pid)
+
+
+def test_workers_that_start_later_leave_ctrl_c_alone_too():
+    """An idle worker takes several tasks, so a pool may start others long after its first."""
+    state = (
+        "__import__('time').sleep(0.1), __import__('os').getpid(), "
+        "__import__('signal').pthread_sigmask(0, [])"
+    )
+    with process_pool(3) as submit:
+        masks = {submit(os.getpid).result(): {signal.SIGINT}}
+        while len(masks) < 3:
+            started = [submit(eval, state) for _ in range(3)]
+            masks |= {pid: mask for _, pid, mask in (one.result() for one in started)}
+    assert all(signal.SIGINT in mask for mask in masks.values())
+
+
+def test_ctrl_c_is_blocked_while_a_worker_imports_its_modules(tmp_path):
+    """Otherwise, workers that are starting end with a traceback each."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import signal\n"
+        "from radejax.core.workers import process_pool\n"
+        'if __name__ == "__mp_main__":\n'
+        "    print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, []))\n"
+        'if __name__ == "__main__":\n'
+        "    with process_pool(1) as submit:\n"
+        "        submit(print, 'started').result()\n"
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True)
+    assert done.stdout == "True\nstarted\n"
 
 
 def test_an_error_beside_the_work_ends_the_workers(tmp_path):
@@ -82,3 +113,84 @@ def test_a_script_without_a_guard_names_what_it_lacks(tmp_path):
     assert done.returncode == 1
     assert "UserError: a worker process ended early" in done.stderr.splitlines()[-1]
     assert '`if __name__ == "__main__":`' in done.stderr.splitlines()[-1]
+
+
+# Numbers of CPUs and workers -------------------------------------------------------------
+
+
+@pytest.fixture
+def machine(tmp_path, monkeypatch):
+    """A machine of 64 CPUs; returns a function that writes files of its kernel."""
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(64)))
+    monkeypatch.setattr(workers, "_PROC", tmp_path / "proc")
+    monkeypatch.setattr(workers, "_CONTROL_GROUPS", tmp_path / "groups")
+
+    def write(texts):
+        for name, text in texts.items():
+            path = tmp_path / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text)
+
+    return write
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="no affinity here")
+def test_cpus_are_those_of_the_affinity():
+    before = os.sched_getaffinity(0)
+    try:
+        os.sched_setaffinity(0, {min(before)})
+        assert usable_cpus() == default_workers() == 1
+    finally:
+        os.sched_setaffinity(0, before)
+
+
+def test_cpus_without_control_groups_and_with_unlimited_ones(machine):
+    assert usable_cpus() == 64
+    machine({"proc/self/cgroup": "0::/\n3:cpu,cpuacct:/\n"})
+    assert usable_cpus() == 64
+    machine(
+        {
+            "groups/cpu.max": "max 100000\n",
+            "groups/cpu/cpu.cfs_quota_us": "-1\n",
+            "groups/cpu/cpu.cfs_period_us": "100000\n",
+        }
+    )
+    assert usable_cpus() == 64
+
+
+@pytest.mark.parametrize(("quota", "count"), [(300_000, 3), (150_000, 2), (1_000, 1)])
+def test_cpus_of_a_container(machine, quota, count):
+    """A limit in the group of the process or in one above it, of either version."""
+    machine(
+        {
+            "proc/self/cgroup": "2:memory:/job\n0::/job/step\n",
+            "groups/job/cpu.max": f"{quota} 100000\n",
+            "groups/job/step/cpu.max": "max 100000\n",
+        }
+    )
+    assert usable_cpus() == count
+    machine({"proc/self/cgroup": "7:cpu,cpuacct:/docker/1a\n2:memory:/docker/1a\n"})
+    assert usable_cpus() == 64
+    machine(
+        {
+            "groups/cpu/cpu.cfs_quota_us": f"{quota}\n",
+            "groups/cpu/cpu.cfs_period_us": "100000\n",
+        }
+    )
+    assert usable_cpus() == count
+
+
+def test_workers_fit_into_the_memory(machine):
+    """Each needs 450 MB of a half of the memory."""
+    assert default_workers() == 64
+    machine({"proc/meminfo": "MemTotal:  9000000 kB\nMemAvailable:  7200000 kB\n"})
+    assert default_workers() == 8
+    machine({"proc/self/cgroup": "2:memory:/job\n"})
+    machine({"groups/memory/memory.limit_in_bytes": "9223372036854771712\n"})
+    assert default_workers() == 8
+    machine({"groups/memory/job/memory.limit_in_bytes": "2000000000\n"})
+    assert default_workers() == 2
+    machine({"proc/self/cgroup": "0::/job\n", "groups/job/memory.max": "max\n"})
+    assert default_workers() == 8
+    machine({"groups/job/memory.max": "100000000\n"})
+    assert default_workers() == 1

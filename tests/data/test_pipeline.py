@@ -1,6 +1,7 @@
 import dataclasses
 import itertools
 import shutil
+import threading
 import types
 
 import chex
@@ -12,6 +13,7 @@ from PIL import Image
 
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import Batch
+from radejax.data import pipeline
 from radejax.data.augment import Augmentation
 from radejax.data.cameras import IMAGE_SIZE, CameraOptions
 from radejax.data.kradar import KRadar
@@ -265,7 +267,7 @@ def test_restored_in_mid_epoch_continues_with_the_next_batch(loader, data, step)
         next(first)
     state = first.get_state()
     wanted = list(first)
-    for changes in ({}, {"num_threads": 0}):
+    for changes in ({}, {"num_threads": 0}, {"num_threads": 1}, {"num_threads": 7}):
         second = loader(**options, **changes)
         next(second)
         second.set_state(state)
@@ -289,6 +291,39 @@ def test_state_travels_with_an_orbax_checkpoint(loader, tmp_path):
             5, args=ocp.args.Composite(data=grain.checkpoint.CheckpointRestore(second))
         )
     assert frames_of(second) == frames_of(first)
+
+
+# Threads -----------------------------------------------------------------------------
+
+
+class Meeting(Records):
+    """Records that are read only when several threads read one at the same time."""
+
+    def __getitem__(self, key):
+        self.source["barrier"].wait(20)
+        return super().__getitem__(key)
+
+
+@pytest.mark.parametrize(
+    ("num_threads", "batch_size"), [(3, 12), (3, 3), (3, 1), (4, 2), (2, 5)]
+)
+def test_all_threads_read_frames_at_the_same_time(
+    records, data, monkeypatch, num_threads, batch_size
+):
+    """By default as many as there are CPUs, and from the first batch on."""
+    barrier = threading.Barrier(num_threads)
+    source = {**records.source, "barrier": barrier}
+    meeting = Meeting(records.folder, records.shape, records.dtype, source)
+    options = dataclasses.replace(OPTIONS, batch_size=batch_size, num_epochs=2)
+    assert options.num_threads is None
+    wanted = make_loader(
+        make_table(records, data, max_objects=5),
+        dataclasses.replace(options, num_threads=0),
+    )
+    monkeypatch.setattr(pipeline, "usable_cpus", lambda: num_threads)
+    loader = make_loader(make_table(meeting, data, max_objects=5), options)
+    for found, batch in zip(loader, wanted, strict=True):
+        chex.assert_trees_all_equal(found, batch)
 
 
 # Options ------------------------------------------------------------------------------

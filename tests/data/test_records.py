@@ -19,6 +19,8 @@ import pytest
 
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
+from radejax.core.workers import process_pool
+from radejax.data import records as records_module
 from radejax.data.dataset import LabelledFrames
 from radejax.data.kradar import KRadar
 from radejax.data.projection import project_tensor
@@ -161,6 +163,25 @@ def test_processes_shards_and_one_process_write_the_same(data, folder, tmp_path)
     for index in (1, 0):
         assert run(data, tmp_path / "shards", shard=(index, 2)).num_frames == 6
     assert contents(tmp_path / "shards") == wanted
+
+
+def test_large_jobs_have_as_many_workers_as_cpus_and_memory_allow(
+    data, folder, tmp_path, monkeypatch
+):
+    numbers = []
+
+    def pool(num_workers):
+        numbers.append(num_workers)
+        return process_pool(num_workers)
+
+    monkeypatch.setattr(records_module, "process_pool", pool)
+    monkeypatch.setattr(records_module, "default_workers", lambda: 2)
+    run(data, tmp_path / "small", num_workers=None)
+    assert numbers == []
+    monkeypatch.setattr(records_module, "_SMALL_JOB_BINS", 0)
+    run(data, tmp_path / "large", num_workers=None)
+    assert numbers == [2]
+    assert contents(tmp_path / "large") == contents(folder)
 
 
 def test_another_run_writes_what_is_missing(data, folder, copy):

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import NamedSharding, PartitionSpec
 
 from radejax import Detector, UserError
 from radejax.core.structures import CLASSES, NARROW_ROI, Batch
@@ -189,6 +190,21 @@ def test_memory_of_the_caller_may_be_refilled(detector, projections):
         taken = detector.put(ring)
         ring[:] = 0.0
         np.testing.assert_array_equal(taken, projections[:count])
+
+
+def test_column_major_tensors_are_copied_and_give_the_same(detector, tesseracts):
+    for frames in (tesseracts[:1], tesseracts[:4]):
+        given = np.stack([np.asfortranarray(frame) for frame in frames])
+        assert not given.flags.c_contiguous
+        _equal(detector(given), detector(frames), atol=0)
+        placed = detector.put(given)
+        given[:] = 0
+        np.testing.assert_array_equal(placed, frames)
+    sharding = NamedSharding(jax.make_mesh((4,), ("data",)), PartitionSpec("data"))
+    sharded = small.detector(batch_sizes=(4,), sharding=sharding)
+    placed = sharded.put(np.stack([np.asfortranarray(x) for x in tesseracts[:4]]))
+    assert placed.sharding.is_equivalent_to(sharding, 5)
+    np.testing.assert_array_equal(placed, tesseracts[:4])
 
 
 def test_region_of_decode_options_holds_where_none_is_given(detector, projections):

@@ -3,7 +3,9 @@
 import errno
 import json
 import pathlib
+import re
 import sys
+import threading
 from unittest import mock
 
 import numpy as np
@@ -12,7 +14,7 @@ from matplotlib.figure import Figure
 
 from radejax.core.config import base_config
 from radejax.core.errors import DiskFullError, UserError
-from radejax.training import distributed
+from radejax.training import distributed, metric_logger
 from radejax.training.metric_logger import MetricLogger, Scores, log_results
 
 
@@ -65,6 +67,34 @@ def test_other_processes_write_nothing(
     with _logger(tmp_path, 0) as logger:
         logger.log(1, {"focal": 1.0}, epoch=1.0)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("num_threads", "text"), [(None, r"\(7 threads"), (3, r"\(3 threads")]
+)
+def test_waiting_for_data_is_warned_of_once(
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    num_threads: int | None,
+    text: str,
+) -> None:
+    monkeypatch.setattr(metric_logger, "usable_cpus", lambda: 7)
+    config = base_config()
+    config.data.num_threads = num_threads
+    wait = threading.Event().wait
+    with MetricLogger(tmp_path, config, start_step=0, num_steps=10) as logger:
+        for step, seconds in ((1, 0.0), (2, 0.2), (3, 0.2)):
+            logger.next_batch(map(wait, [seconds]), None)
+            wait(0.1)  # training
+            logger.log(step, {"focal": 1.0}, epoch=0.1)
+            assert len(caplog.records) == min(step - 1, 1)
+    share = json.loads((tmp_path / "metrics.jsonl").read_text().splitlines()[1])
+    warning = f"training waits for data for {100 * share['data_wait_share']:.0f} %"
+    assert caplog.text.count(warning) == 1
+    assert re.search(
+        rf"raise config\.data\.num_threads {text}.* on 7 CPUs", caplog.text
+    )
 
 
 FULL = pathlib.Path("/dev/full")  # every write to it is "no space left"
