@@ -153,6 +153,19 @@ def all_agree(is_fine: bool) -> bool:
     return bool(multihost_utils.process_allgather(np.int32(is_fine)).all())
 
 
+def list_of_main(values: list[int]) -> list[int]:
+    """Returns the list of process 0 on every process, all of which must call this.
+
+    Processes may see different entries of a folder on a network file system.
+
+    Args:
+        values: Integers below 2**31. Those of other processes than 0 are ignored.
+    """
+    count = int(multihost_utils.broadcast_one_to_all(np.int32(len(values))))
+    own = values if is_main() else [0] * count
+    return multihost_utils.broadcast_one_to_all(np.asarray(own, np.int32)).tolist()
+
+
 class Stopped(Exception):
     """Raised when a signal ends a long computation, such as an evaluation, early."""
 
