@@ -175,8 +175,8 @@ def stop_on_signal(mesh: Mesh) -> Iterator[Callable[[], bool]]:
     """Yields a function that returns whether all processes should stop.
 
     The function returns True on all processes in the same call, once any of them received
-    SIGTERM or SIGINT. Every process must call it equally often. A second signal raises
-    `KeyboardInterrupt` at once.
+    SIGTERM, SIGINT, SIGUSR1 or SIGHUP. Every process must call it equally often. SIGTERM
+    and SIGINT raise `KeyboardInterrupt` at once if another signal came before.
 
     Processes can receive a signal in different steps, and those that continue would wait
     for the others forever. With several processes, each call therefore combines the flags
@@ -190,7 +190,7 @@ def stop_on_signal(mesh: Mesh) -> Iterator[Callable[[], bool]]:
 
     def handle(number: int, _: object) -> None:
         name = signal.Signals(number).name
-        if event.is_set():
+        if event.is_set() and number in (signal.SIGTERM, signal.SIGINT):
             raise KeyboardInterrupt(f"second {name}")
         _log.warning("%s: saving a checkpoint, then stopping", name)
         event.set()
@@ -203,9 +203,12 @@ def stop_on_signal(mesh: Mesh) -> Iterator[Callable[[], bool]]:
         found, before = before, any_of(put_batch(rows, mesh))
         return found is not None and bool(found)
 
+    numbers = [signal.SIGTERM, signal.SIGINT, signal.SIGUSR1]
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # as `nohup` sets it
+        numbers.append(signal.SIGHUP)
     # Python allows only the main thread to set signal handlers.
-    is_main_thread = threading.current_thread() is threading.main_thread()
-    numbers = (signal.SIGTERM, signal.SIGINT) if is_main_thread else ()
+    if threading.current_thread() is not threading.main_thread():
+        numbers = []
     previous = {number: signal.signal(number, handle) for number in numbers}
     try:
         yield stop

@@ -1,5 +1,8 @@
-"""Meshes, placements and processes; real ones are in tests/test_two_processes.py."""
+"""Meshes, placements, processes and signals; tests/test_two_processes.py trains in two."""
 
+import os
+import signal
+from collections.abc import Iterator
 from typing import Any
 
 import chex
@@ -57,6 +60,42 @@ def test_an_error_of_the_main_process_reaches_the_others(two: Any) -> None:
     two(1, main_is_fine=False)
     with pytest.raises(UserError, match="process 0 stopped with an error"):
         distributed.main_only(fail)
+
+
+@pytest.fixture
+def stop() -> Iterator[Any]:
+    mesh = distributed.make_mesh(1)
+    with distributed.stop_on_signal(mesh) as should_stop:
+        yield should_stop
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGINT", "SIGUSR1", "SIGHUP"])
+def test_signals_ask_to_stop(stop: Any, name: str) -> None:
+    assert not stop()
+    os.kill(os.getpid(), signal.Signals[name])
+    assert stop()
+
+
+def test_the_second_signal_of_a_closed_terminal_is_ignored_and_that_of_a_user_is_not(
+    stop: Any,
+) -> None:
+    # The shell and the kernel both send SIGHUP when a terminal is closed.
+    for number in (signal.SIGHUP, signal.SIGHUP, signal.SIGUSR1):
+        os.kill(os.getpid(), number)
+    assert stop()
+    with pytest.raises(KeyboardInterrupt, match="second SIGTERM"):
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+def test_under_nohup_a_closed_terminal_is_ignored() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with distributed.stop_on_signal(distributed.make_mesh(1)) as should_stop:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert not should_stop()
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_put_batch_splits_the_leading_axis() -> None:
