@@ -8,21 +8,26 @@ devices, and XLA gathers them where a layer needs them.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import itertools
 import logging
+import os
 import signal
+import socket
 import threading
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Literal, TypeVar
 
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
+from jax._src import distributed as jax_distributed
 from jax.experimental import multihost_utils
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jaxtyping import PyTree, Shaped
 
-from radejax.core.errors import UserError, require
+from radejax.core.errors import UserError, one_line, require
 
 _log = logging.getLogger(__name__)
 
@@ -32,6 +37,10 @@ DATA_AXIS = "data"
 
 _WAIT_S = 7 * 24 * 3600  # preprocessing all of K-Radar takes hours
 _numbers = itertools.count()
+
+_DONE = "done"
+_GRACE_S = 5
+_LONGEST = 1024  # bytes of a message between processes
 
 
 # Devices -----------------------------------------------------------------------------
@@ -164,6 +173,114 @@ def list_of_main(values: list[int]) -> list[int]:
     count = int(multihost_utils.broadcast_one_to_all(np.int32(len(values))))
     own = values if is_main() else [0] * count
     return multihost_utils.broadcast_one_to_all(np.asarray(own, np.int32)).tolist()
+
+
+@contextlib.contextmanager
+def end_with_others() -> Iterator[None]:
+    """Ends this process with one line and exit code 1 when another one of the run is lost.
+
+    Every process holds a connection to process 0. The operating system closes it as soon
+    as one of the two ends, even if it is killed. Processes that finish the block say so
+    first. One that fails says so too, and the others have a few seconds to fail with the
+    same error. It must be entered by all processes, after `jax.distributed.initialize`.
+    """
+    state = jax_distributed.global_state
+    own = f"process {state.process_id} ({socket.gethostname()})"
+    links = _connect(state, own)
+    has_failed = threading.Event()
+    _delay_aborts()
+    for name in links:
+        watch = threading.Thread(target=_watch, args=(name, links, has_failed))
+        watch.daemon = True
+        watch.start()
+    try:
+        yield
+    except BaseException:
+        # The loss of a process makes collectives fail. `_watch` says then which one it is.
+        time.sleep(1)
+        has_failed.set()
+        _send(f"{_GRACE_S} {own} stopped with an error, see its output", links)
+        raise
+    _send(_DONE, links)
+
+
+def _connect(state: Any, own: str) -> dict[str, socket.socket]:
+    """Connects process 0 with all others.
+
+    Args:
+        state: State of `jax.distributed`.
+        own: Name of this process.
+
+    Returns:
+        Connections by the name of the process at the other end.
+
+    Raises:
+        UserError: Process 0 cannot be reached.
+    """
+    key = "radejax/process 0"
+    if state.process_id:
+        host = state.coordinator_address.rpartition(":")[0].strip("[]")
+        port, _, main = state.client.blocking_key_value_get(key, 300_000).partition(" ")
+        try:
+            links = {main: socket.create_connection((host, port))}
+        except OSError as error:
+            raise UserError(
+                f"cannot connect to {main} at {host}:{port} ({one_line(error)}); open all "
+                "ports between the hosts of a run"
+            ) from error
+        _send(own, links)
+        return links
+    links = {}
+    is_dual = socket.has_dualstack_ipv6()
+    family = socket.AF_INET6 if is_dual else socket.AF_INET
+    with socket.create_server(("", 0), family=family, dualstack_ipv6=is_dual) as server:
+        state.client.key_value_set(key, f"{server.getsockname()[1]} {own}")
+        while len(links) < state.num_processes - 1:
+            link, _ = server.accept()
+            links[link.recv(_LONGEST).decode()] = link
+    return links
+
+
+def _send(text: str, links: Mapping[str, socket.socket]) -> None:
+    for link in links.values():
+        with contextlib.suppress(OSError):  # that process has ended
+            link.sendall(text.encode())
+
+
+def _watch(
+    name: str, links: Mapping[str, socket.socket], has_failed: threading.Event
+) -> None:
+    """Waits for the end of another process, and ends this one if it was not a normal end.
+
+    Args:
+        name: Name of the other process.
+        links: Result of `_connect`.
+        has_failed: Whether this process stopped with an error of its own.
+    """
+    try:
+        text = links[name].recv(_LONGEST).decode()
+    except OSError:
+        text = ""
+    if text == _DONE:
+        return
+    delay_s, _, reason = (text or f"0 {name} was lost").partition(" ")
+    time.sleep(int(delay_s))
+    _send(f"0 {reason}", links)
+    if not has_failed.is_set():
+        line = f"\nerror: {reason}; start all processes again to continue\n"
+        os.write(2, line.encode())
+    os._exit(1)
+
+
+def _delay_aborts() -> None:
+    """Makes an abort of this process wait six seconds, so that `_watch` ends it first.
+
+    JAX aborts all processes when process 0 is lost. The handler of SIGABRT is the C
+    function `sleep`, whose argument is the number of the signal.
+    """
+    libc = ctypes.CDLL(None)
+    libc.signal.argtypes = (ctypes.c_int, ctypes.c_void_p)
+    libc.signal(signal.SIGABRT, ctypes.cast(libc.sleep, ctypes.c_void_p))
 
 
 class Stopped(Exception):

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -14,6 +15,8 @@ from jax.sharding import PartitionSpec
 
 from radejax.core.errors import UserError
 from radejax.training import distributed
+
+from .. import processes
 
 
 @pytest.fixture
@@ -60,6 +63,46 @@ def test_an_error_of_the_main_process_reaches_the_others(two: Any) -> None:
     two(1, main_is_fine=False)
     with pytest.raises(UserError, match="process 0 stopped with an error"):
         distributed.main_only(fail)
+
+
+# Two processes ask each other until one of them is killed or fails.
+TALK = (
+    processes.JOIN
+    + """
+with distributed.end_with_others():
+    print("ready", flush=True)
+    while distributed.all_agree(sys.argv[1] == "nobody fails"):
+        pass
+    if index == 1:
+        raise OSError("a defect")
+    distributed.all_agree(True)
+"""
+)
+
+
+@pytest.mark.parametrize("victim", [0, 1])
+def test_a_killed_process_ends_the_other_in_one_line(victim: int) -> None:
+    started = processes.start(2, "-c", TALK, "nobody fails")
+    processes.wait_for("ready", started)
+    killed_at = time.monotonic()
+    started[victim].kill()
+    output = processes.outputs_of(started, timeout_s=30)[1 - victim]
+    assert time.monotonic() - killed_at < 5
+    assert started[1 - victim].returncode == 1
+    assert output.splitlines().count(processes.lost(victim)) == 1
+    assert "Traceback" not in output
+
+
+def test_a_process_that_fails_ends_the_other() -> None:
+    started = processes.start(2, "-c", TALK, "one fails")
+    outputs = processes.outputs_of(started, timeout_s=60)
+    assert [process.returncode for process in started] == [1, 1]
+    line = processes.lost(1).replace(
+        "was lost", "stopped with an error, see its output"
+    )
+    assert line in outputs[0].splitlines()
+    assert "Traceback" not in outputs[0]
+    assert outputs[1].splitlines()[-1] == "OSError: a defect"
 
 
 @pytest.fixture
