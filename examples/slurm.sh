@@ -22,9 +22,10 @@ set -euo pipefail
 : "${DATA:?folders of K-Radar, separated by commas}" "${WORKDIR:?folder of the run}"
 
 # Slurm sends USR1 to this script 120 s before the time limit. The processes then receive
-# SIGTERM, save a checkpoint and stop, and the job returns to the queue. A run that ends by
-# itself, with or without an error or an evaluation, is never queued again. After a
-# preemption or the failure of a node, Slurm requeues the job (--requeue).
+# SIGTERM, save a checkpoint and stop, and the job returns to the queue. Without "B:", Slurm
+# would send USR1 to the processes, which would also save and stop, and the job would end.
+# A run that ends by itself, with or without an error or an evaluation, is never queued
+# again. After a preemption or the failure of a node, Slurm requeues the job (--requeue).
 is_stopped=false
 stop() {
     is_stopped=true

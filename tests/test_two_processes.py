@@ -1,12 +1,11 @@
 """Two processes that train one model together, against one process with two devices."""
 
 import json
-import os
 import pathlib
 import shutil
-import socket
+import signal
 import subprocess
-import sys
+import time
 
 import chex
 import numpy as np
@@ -15,12 +14,13 @@ from ml_collections import ConfigDict
 
 from radejax.core.config import load_config
 from radejax.inference.saved import load_model
+from radejax.training.checkpoints import Checkpoints
 
+from . import processes
 from . import small_models as small
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 
-REPOSITORY = pathlib.Path(__file__).resolve().parents[1]
 MIDDLE = 3  # of six steps
 
 
@@ -34,33 +34,19 @@ def _config() -> ConfigDict:
     return config
 
 
-def _train(folder: pathlib.Path, run: str, num_processes: int, *overrides: str) -> None:
-    """Run train.py on two devices, in one process or in two."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        coordinator = f"127.0.0.1:{free.getsockname()[1]}"
+def _start(
+    folder: pathlib.Path, run: str, num_processes: int, *overrides: str
+) -> list[subprocess.Popen]:
+    """Start train.py on two devices, in one process or in two."""
     config = small.write_config(folder / "config.py", _config())
-    command = [sys.executable, "train.py", f"--config={config}", *overrides]
-    command += [f"--workdir={folder / run}", f"--data={folder / 'data'}"]
-    started = []
-    for i in range(num_processes):
-        more = [f"--coordinator={coordinator}", f"--num-processes={num_processes}"]
-        more = [*more, f"--process-id={i}"] if num_processes > 1 else []
-        started.append(
-            subprocess.Popen(
-                command + more,
-                cwd=REPOSITORY,
-                env={
-                    **os.environ,
-                    "JAX_PLATFORMS": "cpu",
-                    "JAX_NUM_CPU_DEVICES": str(2 // num_processes),
-                },
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                text=True,
-            )
-        )
-    outputs = [process.communicate(timeout=900)[0] for process in started]
+    places = [f"--workdir={folder / run}", f"--data={folder / 'data'}"]
+    command = ["train.py", f"--config={config}", *overrides, *places]
+    return processes.start(num_processes, *command, num_devices=2 // num_processes)
+
+
+def _train(folder: pathlib.Path, run: str, num_processes: int, *overrides: str) -> None:
+    started = _start(folder, run, num_processes, *overrides)
+    outputs = processes.outputs_of(started, timeout_s=900)
     for process in started:
         assert process.returncode == 0, "\n".join(outputs)
     assert "Done in" in outputs[0]
@@ -136,3 +122,41 @@ def test_only_one_process_writes(runs: pathlib.Path) -> None:
     files = [path.suffix for path in (runs / "two" / "tensorboard").iterdir()]
     assert files.count(".test") == len(files) - 1 == 1  # of the training and the report
     assert not list(runs.rglob("*.tmp"))
+
+
+def _start_long(folder: pathlib.Path, run: str) -> list[subprocess.Popen]:
+    """Start a long training in two processes, and wait for its first steps."""
+    long = [
+        "--config.train.num_epochs=2000",
+        "--config.train.checkpoint_every_steps=9999",
+    ]
+    started = _start(folder, run, 2, *long)
+    path = folder / run / "metrics.jsonl"
+    while not path.exists() or len(_losses(folder / run)) < MIDDLE:
+        time.sleep(0.1)
+        assert all(process.poll() is None for process in started)
+    return started
+
+
+@pytest.mark.parametrize("victim", [0, 1])
+def test_a_killed_process_ends_the_other(runs: pathlib.Path, victim: int) -> None:
+    started = _start_long(runs, f"killed{victim}")
+    started[victim].kill()
+    output = processes.outputs_of(started, timeout_s=30)[1 - victim]
+    assert started[1 - victim].returncode == 1
+    assert output.splitlines().count(processes.lost(victim)) == 1
+    assert "Traceback" not in output
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGUSR1", "SIGHUP"])
+def test_a_signal_to_one_process_stops_both_with_a_checkpoint(
+    runs: pathlib.Path, name: str
+) -> None:
+    started = _start_long(runs, name)
+    started[1].send_signal(signal.Signals[name])
+    outputs = processes.outputs_of(started, timeout_s=120)
+    assert [process.returncode for process in started] == [0, 0], "\n".join(outputs)
+    step = _losses(runs / name)[-1][0]
+    assert f"stopped at step {step}; run the same command" in outputs[0]
+    with Checkpoints(runs / name / "checkpoints", read_only=True) as checkpoints:
+        assert checkpoints.steps()[-1] == step

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from typing import Any
 
@@ -101,6 +102,7 @@ def train(
     """
     from radejax.core.config import config_name, load_config, override
     from radejax.runs.experiment import run, run_seeds
+    from radejax.training.distributed import end_with_others
 
     settings = load_config(config)
     override(settings, ctx.meta["fields"])
@@ -108,14 +110,16 @@ def train(
     settings.data.update({name: value for name, value in data.items() if value})
     entry.set_up_jax()
     place = coordinator, num_processes, process_id
-    if distributed or place != (None,) * 3:
-        join_processes(*place)
     workdir = workdir or f"runs/{config_name(config)}"
     given: dict[str, Any] = {"init_from": init_from, "profile": profile or ""}
-    if seeds:
-        run_seeds(settings, workdir, seeds, **given)
-    else:
-        run(settings, workdir, **given)
+    with contextlib.ExitStack() as processes:
+        if distributed or place != (None,) * 3:
+            join_processes(*place)
+            processes.enter_context(end_with_others())
+        if seeds:
+            run_seeds(settings, workdir, seeds, **given)
+        else:
+            run(settings, workdir, **given)
 
 
 def join_processes(

@@ -7,6 +7,7 @@ when it is restored.
 
 from __future__ import annotations
 
+import concurrent.futures
 import functools
 import hashlib
 import json
@@ -14,8 +15,8 @@ import logging
 import pathlib
 import shutil
 import zlib
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -29,6 +30,8 @@ from radejax.core.errors import DataError, one_line
 from radejax.training import distributed
 
 _log = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 # Orbax logs what it does and raises its errors too, so that its log is not needed.
 absl_logging.get_absl_logger().addFilter(lambda record: "orbax" not in record.pathname)
@@ -161,14 +164,10 @@ class Checkpoints:
         Raises:
             DataError: There are checkpoints, but none is intact. They are not moved.
         """
-        steps = self.steps()
+        steps = distributed.list_of_main(self.steps())
         for step in reversed(steps):
-            found = None
-            try:
-                found = self._read(step, state)
-            except DataError as error:
-                _log.warning("%s", error)
-            if distributed.all_agree(found is not None) and found is not None:
+            found = self._read_on_all(step, state)
+            if found is not None:
                 newer = [other for other in steps if other > step]
                 distributed.main_only(functools.partial(self._move_away, newer))
                 self._manager.reload()
@@ -205,11 +204,22 @@ class Checkpoints:
             raise FileNotFoundError(
                 f"no checkpoint of step {step} in {self.folder}; there are {steps}"
             )
-        found, description = self._read(step)
-        return {n: found.get(n) for n in _VARIABLES}, description["info"], step
+        found = self._read(step)
+        self._verify(step, found)
+        variables, description = found
+        return {n: variables.get(n) for n in _VARIABLES}, description["info"], step
+
+    def _read_on_all(self, step: int, state: Any) -> tuple[Any, dict[str, Any]] | None:
+        """Returns the result of `_read`; None if the checkpoint is corrupted in a process."""
+        found = _on_all(lambda: self._read(step, state))
+        if found is None or not _on_all(lambda: self._verify(step, found)):
+            return None
+        return found
 
     def _read(self, step: int, state: Any = None) -> tuple[Any, dict[str, Any]]:
         """Reads the state and the description of a checkpoint.
+
+        It does not wait for other processes, as reading may fail on one of them only.
 
         Args:
             step: Step of the checkpoint.
@@ -219,6 +229,10 @@ class Checkpoints:
         Raises:
             DataError: The checkpoint is corrupted.
         """
+        alone = ocp.options.MultiprocessingOptions(
+            primary_host=None, active_processes={jax.process_index()}
+        )
+        handler = ocp.CompositeCheckpointHandler()
         try:
             if state is None:
                 state = self._saved_variables(step)
@@ -231,20 +245,36 @@ class Checkpoints:
             )
             text = ocp.args.JsonRestore()
             args = ocp.args.Composite(state=arrays, description=text)
-            found = self._manager.restore(step, args=args)
+            with ocp.Checkpointer(handler, multiprocessing_options=alone) as reader:
+                found = reader.restore(self.folder / str(step), args=args)
             description = found["description"]
             if description.pop("sha256") != _text_checksum(description):
                 raise DataError("the checksum of its description differs")
-            for name, value in array_checksums(found["state"]).items():
-                if description["checksums"].get(name) != value:
-                    raise DataError(f"the checksum of array {name} differs")
         # On corrupted files, orbax, tensorstore and json raise errors of any type.
         except Exception as error:
-            raise DataError(
-                f"checkpoint {step} in {self.folder} is corrupted ({one_line(error)}); "
-                f"there are {self.steps()}"
-            ) from error
+            raise self._corrupted(step, one_line(error)) from error
         return found["state"], description
+
+    def _verify(self, step: int, found: tuple[Any, dict[str, Any]]) -> bool:
+        """Compares the checksums of the arrays that `_read` returned; returns True.
+
+        All processes have to call this function.
+
+        Raises:
+            DataError: They differ.
+        """
+        state, description = found
+        saved = description["checksums"]
+        for name, value in array_checksums(state).items():
+            if saved.get(name) != value:
+                raise self._corrupted(step, f"the checksum of array {name} differs")
+        return True
+
+    def _corrupted(self, step: int, reason: str) -> DataError:
+        return DataError(
+            f"checkpoint {step} in {self.folder} is corrupted ({reason}); there are "
+            f"{self.steps()}"
+        )
 
     def _saved_variables(self, step: int) -> dict[str, Any]:
         """Returns the metadata of the arrays in a checkpoint that are model variables."""
@@ -274,6 +304,21 @@ def _best_of(metrics: Mapping[str, float]) -> float:
     return metrics[_BEST]
 
 
+def _on_all(work: Callable[[], T]) -> T | None:
+    """Calls a function in all processes.
+
+    Returns:
+        The result in this process; None if any process raised `DataError`, of which it
+        warns.
+    """
+    result = None
+    try:
+        result = work()
+    except DataError as error:
+        _log.warning("%s", error)
+    return result if distributed.all_agree(result is not None) else None
+
+
 # Checksums ---------------------------------------------------------------------------
 
 
@@ -286,14 +331,20 @@ def array_checksums(tree: Any) -> dict[str, int]:
     Returns:
         Checksums by the paths of the arrays, such as "params/conv/bias".
     """
-    checksums = {}
+    arrays = {}
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         if not getattr(leaf, "is_fully_addressable", True):
-            leaf = multihost_utils.process_allgather(leaf, tiled=True)
+            is_whole = leaf.is_fully_replicated
+            gather = multihost_utils.process_allgather
+            leaf = leaf.addressable_data(0) if is_whole else gather(leaf, tiled=True)
         # Paths of the restored dictionaries are those of the saved dataclasses and lists.
-        name = jax.tree_util.keystr(path, simple=True, separator="/")
-        checksums[name] = zlib.crc32(np.asarray(leaf).tobytes())
-    return checksums
+        arrays[jax.tree_util.keystr(path, simple=True, separator="/")] = leaf
+    with concurrent.futures.ThreadPoolExecutor() as pool:
+        return dict(zip(arrays, pool.map(_checksum, arrays.values()), strict=True))
+
+
+def _checksum(array: Any) -> int:
+    return zlib.crc32(np.asarray(array).reshape(-1).view(np.uint8).data)
 
 
 def _text_checksum(values: Any) -> str:

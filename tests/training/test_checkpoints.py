@@ -20,6 +20,8 @@ from radejax.core.errors import DataError, DiskFullError
 from radejax.training import distributed
 from radejax.training.checkpoints import Checkpoints, array_checksums
 
+from .. import processes
+
 # Restoring of corrupted files ends orbax's event loop while others are still read.
 pytestmark = pytest.mark.filterwarnings(
     "ignore::pytest.PytestUnraisableExceptionWarning"
@@ -305,3 +307,58 @@ def test_a_corrupted_description_is_an_error(folder: pathlib.Path) -> None:
     shutil.move(folder / "2", folder.with_name("2"))
     with Checkpoints(folder) as checkpoints:
         assert checkpoints.steps() == [1, 3]
+
+
+# Several processes -------------------------------------------------------------------
+
+# Restores from a folder per process one array that all devices hold and one that is split.
+RESTORE = (
+    processes.JOIN
+    + """
+import grain
+import jax
+import numpy as np
+from jax.sharding import NamedSharding, PartitionSpec
+
+from radejax.training.checkpoints import Checkpoints
+
+mesh = distributed.make_mesh()
+iterator = iter(grain.MapDataset.range(1000).repeat(None).to_iter_dataset())
+state = {
+    name: jax.ShapeDtypeStruct((16, 4), np.float32, sharding=NamedSharding(mesh, spec))
+    for name, spec in {"whole": PartitionSpec(), "split": PartitionSpec("data")}.items()
+}
+with Checkpoints(sys.argv[1 + index], max_to_keep=None) as checkpoints:
+    restored, info, step = checkpoints.restore(state, iterator)
+shards = [restored[name].addressable_data(0) for name in ("whole", "split")]
+print([step, *(len(shard) for shard in shards), *(float(s.sum()) for s in shards)])
+"""
+)
+
+
+def test_processes_that_see_different_checkpoints_restore_the_same_one(
+    tmp_path: pathlib.Path,
+) -> None:
+    mine, other, iterator = tmp_path / "mine", tmp_path / "other", _iterator()
+    with Checkpoints(mine, max_to_keep=None) as checkpoints:
+        for step in (1, 2, 3):
+            state = {"whole": WEIGHTS * step, "split": WEIGHTS * -step}
+            state = jax.tree.map(jnp.asarray, state)
+            checkpoints.save(step, state, iterator, info={})
+    shutil.copytree(mine, other)
+    shutil.rmtree(other / "3")  # the listing of the second process is out of date
+    for path in (other / "2" / "state").rglob("*"):
+        if path.is_file():
+            path.write_bytes(b"")
+    started = processes.start(2, "-c", RESTORE, str(mine), str(other))
+    outputs = processes.outputs_of(started, timeout_s=60)
+    assert [p.returncode for p in started] == [0, 0], "\n".join(outputs)
+    for output, rows in zip(outputs, (slice(0, 8), slice(8, 16)), strict=True):
+        found = json.loads(output.splitlines()[-1])
+        assert found[:3] == [1, 16, 8]
+        np.testing.assert_allclose(
+            found[3:], [WEIGHTS.sum(), -WEIGHTS[rows].sum()], 1e-5
+        )
+    assert [path.name for path in mine.iterdir()] == ["1"]
+    moved = tmp_path / "mine_corrupted"
+    assert sorted(path.name for path in moved.iterdir()) == ["2", "3"]

@@ -1,5 +1,9 @@
-"""Meshes, placements and processes; real ones are in tests/test_two_processes.py."""
+"""Meshes, placements, processes and signals; tests/test_two_processes.py trains in two."""
 
+import os
+import signal
+import time
+from collections.abc import Iterator
 from typing import Any
 
 import chex
@@ -11,6 +15,8 @@ from jax.sharding import PartitionSpec
 
 from radejax.core.errors import UserError
 from radejax.training import distributed
+
+from .. import processes
 
 
 @pytest.fixture
@@ -57,6 +63,82 @@ def test_an_error_of_the_main_process_reaches_the_others(two: Any) -> None:
     two(1, main_is_fine=False)
     with pytest.raises(UserError, match="process 0 stopped with an error"):
         distributed.main_only(fail)
+
+
+# Two processes ask each other until one of them is killed or fails.
+TALK = (
+    processes.JOIN
+    + """
+with distributed.end_with_others():
+    print("ready", flush=True)
+    while distributed.all_agree(sys.argv[1] == "nobody fails"):
+        pass
+    if index == 1:
+        raise OSError("a defect")
+    distributed.all_agree(True)
+"""
+)
+
+
+@pytest.mark.parametrize("victim", [0, 1])
+def test_a_killed_process_ends_the_other_in_one_line(victim: int) -> None:
+    started = processes.start(2, "-c", TALK, "nobody fails")
+    processes.wait_for("ready", started)
+    killed_at = time.monotonic()
+    started[victim].kill()
+    output = processes.outputs_of(started, timeout_s=30)[1 - victim]
+    assert time.monotonic() - killed_at < 5
+    assert started[1 - victim].returncode == 1
+    assert output.splitlines().count(processes.lost(victim)) == 1
+    assert "Traceback" not in output
+
+
+def test_a_process_that_fails_ends_the_other() -> None:
+    started = processes.start(2, "-c", TALK, "one fails")
+    outputs = processes.outputs_of(started, timeout_s=60)
+    assert [process.returncode for process in started] == [1, 1]
+    line = processes.lost(1).replace(
+        "was lost", "stopped with an error, see its output"
+    )
+    assert line in outputs[0].splitlines()
+    assert "Traceback" not in outputs[0]
+    assert outputs[1].splitlines()[-1] == "OSError: a defect"
+
+
+@pytest.fixture
+def stop() -> Iterator[Any]:
+    mesh = distributed.make_mesh(1)
+    with distributed.stop_on_signal(mesh) as should_stop:
+        yield should_stop
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGINT", "SIGUSR1", "SIGHUP"])
+def test_signals_ask_to_stop(stop: Any, name: str) -> None:
+    assert not stop()
+    os.kill(os.getpid(), signal.Signals[name])
+    assert stop()
+
+
+def test_the_second_signal_of_a_closed_terminal_is_ignored_and_that_of_a_user_is_not(
+    stop: Any,
+) -> None:
+    # The shell and the kernel both send SIGHUP when a terminal is closed.
+    for number in (signal.SIGHUP, signal.SIGHUP, signal.SIGUSR1):
+        os.kill(os.getpid(), number)
+    assert stop()
+    with pytest.raises(KeyboardInterrupt, match="second SIGTERM"):
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+def test_under_nohup_a_closed_terminal_is_ignored() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with distributed.stop_on_signal(distributed.make_mesh(1)) as should_stop:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert not should_stop()
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_put_batch_splits_the_leading_axis() -> None:
