@@ -383,8 +383,8 @@ def make_loader(
     num_threads = options.num_threads
     if num_threads is None:
         num_threads = usable_cpus()
-    # As few batches at a time as keep all threads busy, for the sake of memory.
-    num_batches = max(2, -(-num_threads // options.batch_size)) if num_threads else 0
+    # One batch more than it takes to occupy all threads: none waits for a batch to end.
+    num_batches = 1 + -(-num_threads // options.batch_size) if num_threads else 0
     reading = grain.ReadOptions(
         num_threads=num_batches, prefetch_buffer_size=num_batches
     )
