@@ -134,6 +134,7 @@ def plain(tiny: Tiny, start: Any) -> tuple[Any, Any, Any]:
     return optimizer, state, jax.jit(_make(tiny, optimizer))
 
 
+@pytest.mark.cpu_only
 @pytest.mark.parametrize("parameters", ["replicated", "fsdp"])
 def test_eight_devices_equal_one(tiny: Tiny, plain: Any, parameters: str) -> None:
     optimizer, state, step = plain
@@ -165,6 +166,7 @@ class _PerBin(nn.Module):
         return DetectionMaps(y[..., :5], y[..., 5:])
 
 
+@pytest.mark.cpu_only
 @pytest.mark.parametrize("num_devices", [1, 2, 4])
 def test_many_devices_send_only_gradients(num_devices: int, tiny: Tiny) -> None:
     least = dataclasses.replace(tiny, model=_PerBin(), map_grid=tiny.grid)
