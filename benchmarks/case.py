@@ -23,7 +23,8 @@ class Case:
             not compared.
         tolerance: Largest permitted `error`; a case above it is not measured.
         mib: Temporary memory of radejax's program in MiB, without arguments and results.
-        compile_s: Time in seconds to trace and compile radejax's program.
+        compile_s: Time in seconds to trace and compile radejax's program, or of a first call that
+            does this.
         note: Remark, or a function that returns it after the measurement.
     """
 
@@ -36,6 +37,11 @@ class Case:
     mib: float | None = None
     compile_s: float | None = None
     note: str | Callable[[], str] = ""
+
+    @property
+    def key(self):
+        """Name, dtype and frames, which identify a row."""
+        return self.name, self.dtype, self.frames
 
 
 def difference(found, wanted):
@@ -54,6 +60,11 @@ def compiled(function, *arguments, precision=None, **options):
     seconds = time.perf_counter() - began
     mib = program.memory_analysis().temp_size_in_bytes / 2**20
     return program, {"mib": mib, "compile_s": seconds}
+
+
+def first_call(function):
+    """Returns the `Case` field with the time of a first call of a column, which compiles."""
+    return {"compile_s": function()[0]}
 
 
 def timed(function):

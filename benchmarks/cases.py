@@ -19,7 +19,7 @@ import numpy as np
 import scipy.io
 import stages
 import start
-from case import Case, compiled, difference, timed, waiting
+from case import Case, compiled, difference, first_call, timed, waiting
 
 from radejax.core.config import load_config
 from radejax.data.kradar.write import write_tesseract
@@ -78,7 +78,7 @@ def nms(machine):
     """Decoding of peaks to boxes with NMS, compared with the released Python loops."""
     for peaks in (40, 100):
         maps, loops = inputs.make_maps(peaks), inputs.peaks_on_host(peaks)
-        ours = inputs.jitted_decode(128)
+        ours, cost = compiled(inputs.decoder(128), maps)
         found = ours(maps)
         kept = np.stack([f[2] for f in inputs.loop_decode(*loops)])
         boxes = np.asarray(found.boxes[0])[np.asarray(found.is_valid[0])]
@@ -91,6 +91,7 @@ def nms(machine):
                 ),
             },
             error=difference([boxes], [kept]),
+            **cost,
         )
 
 
@@ -194,6 +195,7 @@ def deploy(machine):
             export(found, folder)
             program = load_exported(folder)
             columns = {"radejax": waiting(found, x), "StableHLO": waiting(program, x)}
+            cost = first_call(columns["radejax"])
             scores = [np.asarray(program(x)["scores"])]
             if has_onnx:
                 export(found, folder, kind="onnx")
@@ -208,6 +210,7 @@ def deploy(machine):
             error=max(difference([s], [np.asarray(found(x).scores)]) for s in scores),
             tolerance=1e-4,
             note="projection to boxes; difference of scores",
+            **cost,
         )
 
 

@@ -10,7 +10,6 @@ import pathlib
 import tempfile
 import types
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import shapely
@@ -215,17 +214,15 @@ def loop_iou(a: np.ndarray, b: np.ndarray) -> float:
     return shared / (shape_a.area + shape_b.area - shared)
 
 
-def jitted_decode(pre_nms):
-    """Returns a jitted decoder of maps with the given number of peaks before NMS."""
-    return jax.jit(
-        functools.partial(
-            decode,
-            grid=MAP_GRID,
-            max_detections=pre_nms,
-            pre_nms=pre_nms,
-            score_threshold=THRESHOLD,
-            nms_iou=NMS_IOU,
-        )
+def decoder(pre_nms):
+    """Returns a decoder of maps with the given number of peaks before NMS."""
+    return functools.partial(
+        decode,
+        grid=MAP_GRID,
+        max_detections=pre_nms,
+        pre_nms=pre_nms,
+        score_threshold=THRESHOLD,
+        nms_iou=NMS_IOU,
     )
 
 

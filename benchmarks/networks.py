@@ -5,7 +5,6 @@ Weights and inputs are random and have full size: projections of 256 x 107 x 101
 """
 
 import functools
-import itertools
 import pathlib
 import time
 
@@ -14,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import stages
-from case import Case, compiled, difference, timed, waiting
+from case import Case, compiled, difference, first_call, timed, waiting
 from rival import ATTENTION
 
 from radejax import models
@@ -34,6 +33,7 @@ TOLERANCES = {"float32": 1e-3, "tf32": 0.05, "bfloat16": 0.2}
 
 FORWARD = [("bfloat16", 8), ("tf32", 8), ("bfloat16", 1), ("float32", 8)]
 TRAINING = [("bfloat16", 8), ("tf32", 8), ("float32", 8)]
+DETECTOR = [("bfloat16", 1), ("bfloat16", 8), ("tf32", 1), ("tf32", 8)]
 COMPILED = {("bfloat16", 8), ("tf32", 8)}
 """Cases of RADE-Net's forward pass that are also measured with `torch.compile` on a GPU.
 
@@ -41,9 +41,16 @@ The others are measured without it, as compilation takes most of the time on a G
 """
 
 
-def settings(machine, those):
-    """Returns the pairs of dtype and batch size to measure: on a CPU, float32 and one frame."""
-    return [("float32", 1)] if machine["platform"] == "cpu" else those
+def settings(machine, name, those):
+    """Returns the pairs of dtype and batch size of a row that are to be measured.
+
+    On a CPU, this is float32 and one frame. `machine["batch"]` replaces the batch sizes, unless it
+    is None. Pairs in `machine["measured"]` are left out, as compiling takes most of the time.
+    """
+    pairs = [("float32", 1)] if machine["platform"] == "cpu" else those
+    if machine["batch"]:
+        pairs = list(dict.fromkeys((dtype, machine["batch"]) for dtype, _ in pairs))
+    return [pair for pair in pairs if (name, *pair) not in machine["measured"]]
 
 
 # Weights and models ------------------------------------------------------------------
@@ -115,7 +122,8 @@ def same_maps(machine, maps):
 def step_of(config, model, variables, batch, precision):
     """Returns a training step of radejax and the fields of a `Case` with its cost.
 
-    The step keeps its state between calls. It takes a batch, by default the one given here.
+    The step keeps its state between calls. It takes a batch, by default the one given here, and
+    returns its metrics.
     """
     optimizer = make_optimizer(config.train, lambda _: 1e-4)
     state = create_state(
@@ -134,12 +142,19 @@ def step_of(config, model, variables, batch, precision):
 
     def run(batch=given):
         held[0], metrics = program(held[0], batch, rng)
-        jax.block_until_ready(metrics)
+        return jax.block_until_ready(metrics)
 
     return run, cost
 
 
-NO_LOSSES = "ours with the losses, torch's with a mean square instead"
+def torch_losses(config, model, batch):
+    """Returns the arguments of `torch_losses.Losses` for the losses of `step_of`."""
+    map_grid = models.map_grid(GRID, model, "true")
+    bins = map_grid.nearest_bin(batch.boxes[..., 0], batch.boxes[..., 1])
+    centers = map_grid.boxes_at(jnp.zeros(batch.boxes.shape), bins)[..., :2]
+    targets = {"boxes": batch.boxes, "classes": batch.classes}
+    targets |= {"bins": np.asarray(bins), "centers": np.asarray(centers)}
+    return config.loss.to_dict(), targets, map_grid.num_azimuth
 
 
 # Cases -------------------------------------------------------------------------------
@@ -147,18 +162,19 @@ NO_LOSSES = "ours with the losses, torch's with a mean square instead"
 
 def radenet(machine):
     """Forward pass of RADE-Net."""
-    for dtype, size in settings(machine, FORWARD):
+    name = "RADE-Net, forward"
+    for dtype, size in settings(machine, name, FORWARD):
         config, model, precision = network("radenet.py", dtype)
         x = inputs.frames_of(size).projection
         variables = random_variables(model, x)
         on_device = jax.device_put((variables, x))
         forward, cost = compiled(model.apply, *on_device, precision=precision)
         state = radenet_torch.save(model, variables)
-        how = dtype, "forward", (dtype, size) in COMPILED
+        how = dtype, None, (dtype, size) in COMPILED
         columns = {"radejax": waiting(forward, *on_device)}
         columns |= rivals(machine, "radenet", dict(config.model), state, x, *how)
         yield Case(
-            name="RADE-Net, forward",
+            name=name,
             columns=columns,
             frames=size,
             dtype=dtype,
@@ -170,26 +186,32 @@ def radenet(machine):
 
 def radenet_training(machine):
     """Training step of RADE-Net, on an accelerator also with rematerialization."""
-    chosen = [(*pair, "none") for pair in settings(machine, TRAINING)]
+    name = "RADE-Net, training step"
+    chosen = [(name, "none", *x) for x in settings(machine, name, TRAINING)]
     if machine["platform"] != "cpu":
-        chosen += [("bfloat16", 8, kind) for kind in ("blocks", "full")]
-    for dtype, size, remat in chosen:
+        for remat in ("blocks", "full"):
+            row = f"{name}, rematerialization: {remat}"
+            chosen += [(row, remat, *x) for x in settings(machine, row, TRAINING[:1])]
+    for row, remat, dtype, size in chosen:
         config, model, precision = network("radenet.py", dtype, remat=remat)
         batch = inputs.frames_of(size)
         variables = random_variables(model, batch.projection)
         step, cost = step_of(config, model, variables, batch, precision)
-        columns = {"radejax": functools.partial(timed, step)}
-        if remat == "none":
+        columns, error = {"radejax": functools.partial(timed, step)}, None
+        if machine["rival"] and remat == "none":
             state = radenet_torch.save(model, variables)
-            how = dtype, "training step", False
+            how = dtype, torch_losses(config, model, batch), False
             given = dict(config.model), state, batch.projection
             columns |= rivals(machine, "radenet", *given, *how)
+            ours = [np.asarray(step()["weighted_sum"])]
+            error = difference(ours, machine["rival"].outputs())
         yield Case(
-            name="RADE-Net, training step",
+            name=row,
             columns=columns,
             frames=size,
             dtype=dtype,
-            note=NO_LOSSES if remat == "none" else f"rematerialization: {remat}",
+            error=error,
+            tolerance=TOLERANCES[dtype],
             **cost,
         )
 
@@ -238,20 +260,16 @@ def fed(step, batches):
 
 def dinorade(machine, task="forward"):
     """DinoRADE from image and projection: forward pass or training step."""
-    for dtype, size in settings(machine, FORWARD if task == "forward" else TRAINING):
+    name, those = f"DinoRADE, {task}", FORWARD if task == "forward" else TRAINING
+    for dtype, size in settings(machine, name, those):
         config, model, precision = network("dinorade.py", dtype)
+        places, camera = camera_of(model, size)
         rng = np.random.default_rng(0)
         image = rng.integers(0, 256, (size, *model.image_size, 3), np.uint8)
-        places = reference_points(
-            inputs.CALIBRATION.camera(), model.query_grid, 256, 112
-        ).points
-        places = np.asarray(places, np.float32)
-        # All queries count as in view, as in the PyTorch network.
-        camera = ReferencePoints(places, np.ones(places.shape[:-1], bool))
         batch = inputs.frames_of(size, image=image, camera=camera)
         arguments = batch.projection, image, camera
         variables = random_variables(model, *arguments)
-        error, note = None, NO_LOSSES
+        losses = None
         if task == "forward":
             on_device = jax.device_put((variables, *arguments))
             program, cost = compiled(model.apply, *on_device, precision=precision)
@@ -259,30 +277,44 @@ def dinorade(machine, task="forward"):
         else:
             step, cost = step_of(config, model, variables, batch, precision)
             run = functools.partial(timed, step)
+            losses = torch_losses(config, model, batch)
         others = rivals(
             machine,
             "dinorade",
             config.model.to_dict(),
             torch_state(model, variables),
-            places.reshape(256 * 112, -1, 2),
+            places,
             batch.projection,
             image,
             dtype,
-            task,
+            losses,
             False,
         )
-        if task == "forward":
-            error, note = same_maps(machine, program(*on_device)), ""
+        # Training steps are not compared, as dropout is random.
+        is_same = task == "forward"
         yield Case(
-            name=f"DinoRADE, {task}",
+            name=name,
             columns={"radejax": run} | others,
             frames=size,
             dtype=dtype,
-            error=error,
+            error=same_maps(machine, program(*on_device)) if is_same else None,
             tolerance=TOLERANCES[dtype],
-            note=note,
             **cost,
         )
+
+
+def camera_of(model, size):
+    """Returns K-Radar's reference points `[R * A, E, 2]`, and the same for every frame of a batch.
+
+    All queries count as in view, as in the PyTorch network.
+    """
+    places = reference_points(
+        inputs.CALIBRATION.camera(), model.query_grid, 256, 112
+    ).points
+    places = np.asarray(places, np.float32)
+    every = np.broadcast_to(places, (size, *places.shape[1:]))
+    camera = ReferencePoints(every, np.ones(every.shape[:-1], bool))
+    return places.reshape(256 * 112, -1, 2), camera
 
 
 def attention(machine):
@@ -336,10 +368,8 @@ def attention(machine):
 
 def detector(machine):
     """Tesseracts in host memory to boxes, compared with the steps of the released code."""
-    is_cpu = machine["platform"] == "cpu"
-    for dtype, size in itertools.product(
-        ("float32",) if is_cpu else ("bfloat16", "tf32"), (1, 8)
-    ):
+    name = "tesseract to boxes"
+    for dtype, size in settings(machine, name, DETECTOR):
         config, model, _ = network("radenet.py", dtype)
         found = stages.untrained(config, dtype=config.model.dtype)
         sized = found.replace(batch_sizes=(size,))
@@ -347,11 +377,12 @@ def detector(machine):
         frames = rng.standard_exponential((size, *GRID.shape_drea), np.float32)
         frames *= 1e9
         columns = {"radejax": waiting(sized, frames)}
+        cost = first_call(columns["radejax"])
         if machine["rival"]:
             variables = jax.tree.map(np.asarray, found.variables)
             state = radenet_torch.save(model, variables)
             x = inputs.frames_of(size).projection
-            how = dtype, "forward", False
+            how = dtype, None, False
             (theirs,) = rivals(
                 machine, "radenet", dict(config.model), state, x, *how
             ).values()
@@ -359,11 +390,12 @@ def detector(machine):
                 released_chain, frames, theirs, inputs.peaks_on_host(40)
             )
         yield Case(
-            name="tesseract to boxes",
+            name=name,
             columns=columns,
             frames=size,
             dtype=dtype,
             note="released chain: formula of all cells, torch, loops over 40 peaks",
+            **cost,
         )
 
 

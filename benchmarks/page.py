@@ -9,19 +9,64 @@ RESULTS, PAGE = (
     ROOT / "docs" / "reports" / "benchmarks",
     ROOT / "docs" / "reports" / "benchmarks.md",
 )
+FURTHER = "further cases of "
 BEGIN, END = "<!-- tables: benchmarks/run.py -->", "<!-- end of tables -->"
 
 
+def path_of(device, folder):
+    """Returns the JSON file of a device."""
+    name = re.sub(r"[^a-z0-9]+", "_", device.lower()).strip("_")
+    return folder / f"{name}.json"
+
+
+def stored(device, folder):
+    """Returns the runs in the file of a device."""
+    path = path_of(device, folder)
+    return json.loads(path.read_text())["runs"] if path.is_file() else []
+
+
+def key(row):
+    """Name, dtype and frames of a row, as in `Case.key`."""
+    return row["name"], row.get("dtype"), row.get("frames")
+
+
+def measured(facts, folder):
+    """Returns the keys of rows, and the complete benchmarks, of earlier runs like this one.
+
+    They are on the same device, with the same versions of radejax and the other packages.
+    """
+    runs = stored(facts["device"], folder)
+    same = [run for run in runs if run["versions"] == facts["versions"]]
+    rows = [row for run in same for row in run["rows"]]
+    begun = {name for run in same for name in run["not_run"]}
+    begun |= {FURTHER + row["benchmark"] for row in rows if "refused" in row}
+    names = {row["benchmark"] for row in rows}
+    complete = {name for name in names if FURTHER + name not in begun}
+    return {key(row) for row in rows if "refused" not in row}, complete
+
+
 def store(run, folder):
-    """Writes a run into the file of its device, replacing earlier results of its benchmarks."""
+    """Writes a run into the file of its device.
+
+    It replaces earlier rows of its benchmarks, except those of the same versions that it did not
+    repeat.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    name = re.sub(r"[^a-z0-9]+", "_", run["device"].lower()).strip("_")
-    path = folder / f"{name}.json"
-    runs = json.loads(path.read_text())["runs"] if path.is_file() else []
+    runs = stored(run["device"], folder)
     new = {row["benchmark"] for row in run["rows"]}
+    repeated = {key(row) for row in run["rows"]}
+    finished = {*run["complete"], *(FURTHER + name for name in run["complete"])}
     for old in runs:
-        old["rows"] = [row for row in old["rows"] if row["benchmark"] not in new]
-    runs = [*(old for old in runs if old["rows"]), run]
+        is_same = old["versions"] == run["versions"]
+        old["rows"] = [
+            row
+            for row in old["rows"]
+            if row["benchmark"] not in new
+            or (is_same and key(row) not in repeated and "refused" not in row)
+        ]
+        old["not_run"] = [name for name in old["not_run"] if name not in finished]
+    runs = [kept for kept in (*runs, run) if kept["rows"]]
+    path = path_of(run["device"], folder)
     path.write_text(json.dumps({"runs": runs}, indent=1) + "\n")
 
 
@@ -55,8 +100,8 @@ def devices_table(runs):
         f"### {runs[-1]['device']}",
         "",
         "| stage | dtype | frames | radejax, per frame | compared with, per frame | speedup | "
-        "greatest difference | memory | |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "greatest difference | memory | compilation | |",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
     rows = [(row, run["platform"]) for run in runs for row in run["rows"]]
     lines += [row_text(*row) for row in rows if "refused" not in row[0]]
@@ -73,7 +118,7 @@ def devices_table(runs):
             f"{', '.join(names)}.",
         ]
         if run["not_run"]:
-            lines.append(f"Not run, for want of time: {', '.join(run['not_run'])}.")
+            lines.append(f"Not run: {', '.join(run['not_run'])}.")
     return "\n".join(lines)
 
 
@@ -103,6 +148,7 @@ def row_text(row, where):
         "; ".join(ratios) or "-",
         "-" if row["error"] is None else f"{row['error']:.0e}",
         "-" if row["mib"] is None else f"{row['mib']:.0f} MiB",
+        "-" if row.get("compile_s") is None else duration(row["compile_s"]),
         row["note"],
     ]
     return f"| {' | '.join(cells)} |"

@@ -26,13 +26,10 @@ class Rival:
     def __init__(self, device):
         key = os.urandom(16)
         with multiprocessing.connection.Listener(authkey=key) as listener:
-            ours = "GLIBC_TUNABLES"  # of radejax.core.memory; torch uses defaults
-            theirs = {k: v for k, v in os.environ.items() if k != ours}
             code = "import sys, torch_half; torch_half.serve(*sys.argv[1:])"
             self._process = subprocess.Popen(
                 [sys.executable, "-c", code, listener.address, key.hex(), device],
                 cwd=pathlib.Path(__file__).parent,
-                env=theirs,
             )
             self._connection = listener.accept()
         self.is_there = self._connection.recv()

@@ -2,19 +2,24 @@
 
     python benchmarks/run.py                       # everything
     python benchmarks/run.py --only radenet tpm    # some
-    python benchmarks/run.py --minutes 15          # what did not fit is listed
+    python benchmarks/run.py --minutes 15          # what did not fit is listed; again: the rest
     python benchmarks/run.py --tables              # only write the tables again
 
 radejax and, if it is installed, torch (eager, and with `torch.compile` on a GPU) run in two
 processes that alternate. Results are compared first; a case whose results differ is not measured,
 and the exit code is 1. Writes `docs/reports/benchmarks/DEVICE.json` and the tables of
 `docs/reports/benchmarks.md`. Times are medians of wall and CPU time per frame. Speedups are ratios
-of CPU times on a CPU, where other processes may run, and of wall times otherwise. New measurements
-replace earlier ones of the same benchmarks on the same device.
+of CPU times on a CPU, where other processes may run, and of wall times otherwise.
+
+What is stored of the same device and versions is not measured again, unless `--again` is given: a
+call continues where an earlier one ended. The version of radejax includes a checksum of its code.
+New measurements replace those of the same benchmarks with other versions.
 """
 
 import argparse
 import datetime
+import functools
+import hashlib
 import os
 import pathlib
 import platform
@@ -34,7 +39,7 @@ import page
 import rival
 from cases import BENCHMARKS
 
-from radejax.core import memory
+import radejax
 
 MAX_REPEATS = 20
 SECONDS_A_CASE = 30.0  # the first repeats are slower, as they still allocate memory
@@ -48,63 +53,104 @@ def main():
         "--minutes", type=float, default=20.0, help="after which no case is started"
     )
     parser.add_argument(
+        "--batch", type=int, help="frames per call of the networks (default: several)"
+    )
+    parser.add_argument(
+        "--again", action="store_true", help="also what is stored of these versions"
+    )
+    parser.add_argument(
         "--out", type=pathlib.Path, default=page.RESULTS, help="JSON file's folder"
     )
     parser.add_argument("--tables", action="store_true", help="measure nothing")
     arguments = parser.parse_args()
     is_whole = True
     if not arguments.tables:
-        memory.restart_with_huge_pages()  # like every command, unlike the process of torch
-        jax.config.update("jax_enable_compilation_cache", False)
-        chosen = {name: BENCHMARKS[name] for name in arguments.only or BENCHMARKS}
-        result = run(
-            chosen, 60 * arguments.minutes, lambda part: page.store(part, arguments.out)
-        )
-        is_whole = not any("refused" in row for row in result["rows"])
-        print(page.devices_table([result]))
+        is_whole = measure(arguments)
     if arguments.out == page.RESULTS:
         page.write_page()
     sys.exit(not is_whole)
 
 
-def run(chosen, seconds, store=lambda so_far: None):
+def measure(arguments):
+    """Runs and stores what the arguments select; returns whether no case was refused."""
+    jax.config.update("jax_enable_compilation_cache", False)
+    machine = machine_of(arguments.batch)
+    complete = set()
+    if not arguments.again:
+        machine["measured"], complete = page.measured(facts(machine), arguments.out)
+    if arguments.batch:
+        complete = set()
+    chosen = {
+        name: BENCHMARKS[name]
+        for name in arguments.only or BENCHMARKS
+        if name not in complete
+    }
+    result = run(
+        chosen,
+        60 * arguments.minutes,
+        machine,
+        lambda so_far: page.store(so_far, arguments.out),
+    )
+    print(page.devices_table([result]))
+    return not any("refused" in row for row in result["rows"])
+
+
+def machine_of(batch=None):
+    """Returns what benchmarks are given: device, PyTorch if it is there, and what to measure."""
+    device = jax.devices()[0]
+    return {
+        "device": device,
+        "platform": device.platform,
+        "rival": rival.start(device.platform),
+        "batch": batch,
+        "measured": set(),
+    }
+
+
+def run(chosen, seconds, machine, store=lambda so_far: None):
     """Runs the benchmarks that fit into the time and returns the results of the run.
 
     They are passed to `store` after each case, so that an interrupted run keeps its results.
     """
     began = time.perf_counter()
-    device = jax.devices()[0]
-    other = rival.start(device.platform)
-    machine = {"platform": device.platform, "rival": other}
-    rows, not_run = [], []
+    rows, not_run, complete = [], [], []
 
     def so_far():
-        return facts(device, "torch" if other else None) | {
+        return facts(machine) | {
             "minutes": round((time.perf_counter() - began) / 60, 1),
             "rows": rows,
             "not_run": not_run,
+            "complete": complete,
         }
 
     for name, cases in chosen.items():
         if time.perf_counter() - began > seconds:
             not_run.append(name)
             continue
+        not_run.append(page.FURTHER + name)  # a run that is interrupted says so
         try:
             for case in cases(machine):
+                if case.key in machine["measured"]:
+                    continue
                 sys.stderr.write(f"{case.name}, {case.dtype}, {case.frames}\n")
                 left = seconds - (time.perf_counter() - began)
                 rows.append({"benchmark": name} | measured(case, left))
                 store(so_far())
                 if time.perf_counter() - began > seconds:
-                    not_run.append(f"further cases of {name}")
                     break
                 del case  # free its arrays before the next case is built
+            else:
+                if not machine["batch"]:
+                    not_run.pop()
+                    complete.append(name)
+                store(so_far())
         except Exception as error:  # the table lists it; others still run
             traceback.print_exc()
+            not_run.pop()
             rows.append({"benchmark": name, "name": name, "refused": repr(error)[:300]})
             store(so_far())
-    if other:
-        other.close()
+    if machine["rival"]:
+        machine["rival"].close()
     result = so_far()
     store(result)
     return result
@@ -138,21 +184,33 @@ def measured(case, seconds_left):
     }
 
 
-def facts(device, *more):
+def facts(machine):
     """Returns device, date, versions, load and command of a run."""
-    packages = ("jax", "numpy", *filter(None, more))
-    name = device.device_kind
-    if device.platform == "cpu":
+    packages = ["jax", "numpy"] + ["torch"] * (machine["rival"] is not None)
+    name = machine["device"].device_kind
+    if machine["platform"] == "cpu":
         name = f"{processor_name()}, {os.cpu_count()} cores"
+    versions = {"radejax": f"{radejax.__version__}+{checksum()}"}
+    script = pathlib.Path(sys.argv[0]).name
     return {
         "device": name,
-        "platform": device.platform,
+        "platform": machine["platform"],
         "date": datetime.date.today().isoformat(),
         "python": platform.python_version(),
-        "versions": {p: metadata.version(p) for p in packages},
+        "versions": versions | {p: metadata.version(p) for p in packages},
         "load": os.getloadavg()[0],
-        "command": shlex.join(["python", "benchmarks/run.py", *sys.argv[1:]]),
+        "command": shlex.join(["python", f"benchmarks/{script}", *sys.argv[1:]]),
     }
+
+
+@functools.cache
+def checksum():
+    """Returns eight digits of the SHA-256 of radejax's code."""
+    folder = pathlib.Path(radejax.__file__).parent
+    digest = hashlib.sha256()
+    for path in sorted(folder.rglob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:8]
 
 
 def processor_name(path=pathlib.Path("/proc/cpuinfo")):

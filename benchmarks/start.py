@@ -16,7 +16,7 @@ import time
 from case import Case
 
 _ROOT = pathlib.Path(__file__).resolve().parents[1]
-_FIRST_STEP = " 1/12 ["  # the progress bar contains it after the first step
+FIRST_STEP = ("train: ", "| 1/")  # the progress bar contains it after the first step
 _DETECT = f"""
 import sys
 sys.path.append({str(_ROOT / "benchmarks")!r})
@@ -38,10 +38,13 @@ def start(machine):
         def train(programs):
             arguments = [str(_ROOT / "train.py"), "--config", "quickstart:short"]
             arguments += ["--workdir", str(folder / f"run{next(numbers)}")]
-            return until(_FIRST_STEP, arguments, folder, programs)
+            (_, wall), processor = until(FIRST_STEP, arguments, folder, programs)
+            return wall, processor
 
         def detect(programs):
-            return until("found:", ["-c", _DETECT], folder, programs)
+            arguments = ["-c", _DETECT]
+            (wall,), processor = until(["found:"], arguments, folder, programs)
+            return wall, processor
 
         def anew(run):
             return run(folder / f"programs{next(numbers)}")
@@ -62,17 +65,18 @@ def start(machine):
             )
 
 
-def until(text, arguments, folder, programs):
-    """Returns wall and CPU seconds of a Python process until it writes a text.
+def until(texts, arguments, folder, programs):
+    """Returns wall seconds of a Python process until each of several texts, and its CPU seconds.
 
     Args:
-        text: Text that ends the measurement; the process is killed then.
+        texts: Texts that the process writes one after the other. The last one ends the
+            measurement; the process is killed then.
         arguments: Arguments of the interpreter.
         folder: Working directory.
         programs: Folder of the compilation cache.
 
     Raises:
-        RuntimeError: The process ended without writing the text.
+        RuntimeError: The process ended without writing a text.
     """
     environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(programs)}
     began = time.perf_counter()
@@ -83,18 +87,19 @@ def until(text, arguments, folder, programs):
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
     )
-    output = b""
+    output, end, seconds = b"", 0, []
     # The output is not read by lines, because the progress bar does not end its line.
-    while chunk := process.stdout.read1():
+    while len(seconds) < len(texts) and (chunk := process.stdout.read1()):
         output += chunk
-        if text.encode() in output:
-            seconds = time.perf_counter() - began
-            process.kill()
-            _, process.returncode, usage = os.wait4(process.pid, 0)
-            process.stdout.close()
-            return seconds, usage.ru_utime + usage.ru_stime
-    process.wait()
+        for text in texts[len(seconds) :]:
+            if (place := output.find(text.encode(), end)) < 0:
+                break
+            end = place + len(text)
+            seconds.append(time.perf_counter() - began)
+    process.kill()
+    _, process.returncode, usage = os.wait4(process.pid, 0)
     process.stdout.close()
-    raise RuntimeError(
-        f"no {text!r} from {arguments}: {output[-2000:].decode(errors='replace')}"
-    )
+    if len(seconds) < len(texts):
+        text = output[-2000:].decode(errors="replace")
+        raise RuntimeError(f"no {texts[len(seconds)]!r} from {arguments}: {text}")
+    return seconds, usage.ru_utime + usage.ru_stime

@@ -9,6 +9,7 @@ import torch_dinorade
 import torch_radenet
 from case import timed
 from rival import ATTENTION
+from torch_losses import Losses
 
 
 def serve(address, key, device):
@@ -43,10 +44,11 @@ def _channels_first(x):
     return np.ascontiguousarray(x.transpose(0, 3, 1, 2))
 
 
-def _calls(device, network, dtype, task, is_compiled, inputs):
+def _calls(device, network, dtype, losses, is_compiled, inputs):
     """Returns functions by column name that run a forward pass or a training step.
 
-    A step is a forward pass, the gradient of the outputs' mean square, and an AdamW update.
+    A step is a forward pass, the gradient of the losses, and an AdamW update; it returns their
+    plain weighted sum. `losses` is None for forward passes, or the arguments of `Losses`.
     """
     torch.backends.cuda.matmul.allow_tf32 = dtype == "tf32"
     torch.backends.cudnn.allow_tf32 = dtype == "tf32"
@@ -57,7 +59,8 @@ def _calls(device, network, dtype, task, is_compiled, inputs):
     inputs = [torch.tensor(x, device=device) for x in inputs]
     trained = [p for p in network.parameters() if p.requires_grad]
     optimizer = torch.optim.AdamW(trained, 1e-4, weight_decay=0.01)
-    network.train(task == "training step")
+    network.train(losses is not None)
+    losses = losses and Losses(*losses, device)
     half = functools.partial(
         torch.autocast, device, torch.bfloat16, enabled=dtype == "bfloat16"
     )
@@ -73,12 +76,14 @@ def _calls(device, network, dtype, task, is_compiled, inputs):
         optimizer.zero_grad(set_to_none=True)
         with half():
             outputs = run(*inputs)
-        sum(o.float().square().mean() for o in outputs).backward()
+        loss, weighted_sum = losses(*outputs)
+        loss.backward()
         optimizer.step()
         if device == "cuda":
             torch.cuda.synchronize()
+        return [weighted_sum]
 
-    chosen = {"forward": forward, "training step": step}[task]
+    chosen = step if losses else forward
     networks = {"torch": network}
     if is_compiled and device == "cuda":
         networks["torch.compile"] = torch.compile(network)
@@ -86,7 +91,7 @@ def _calls(device, network, dtype, task, is_compiled, inputs):
 
 
 def radenet(device, config, state, projection, *how):
-    """Builds RADE-Net; `how` is dtype, task and is_compiled as in `_calls`."""
+    """Builds RADE-Net; `how` is dtype, losses and is_compiled as in `_calls`."""
     network = torch_radenet.RadeNet(config)
     network.load_state_dict(_tensors(state))
     return _calls(device, network, *how, [_channels_first(projection)])
@@ -105,7 +110,7 @@ def attention(device, state, feature, scale, points, value):
     module.load_state_dict(_tensors(state))
     value = np.ascontiguousarray(value.transpose(0, 3, 1, 2))
     arrays = feature, scale, points[0], value
-    calls = _calls(device, module, "float32", "forward", False, arrays)
+    calls = _calls(device, module, "float32", None, False, arrays)
     return {name: lambda call=call: [call()] for name, call in calls.items()}
 
 

@@ -8,22 +8,12 @@ import pathlib
 import tempfile
 import types
 from collections.abc import Generator, Iterator
-
-import pytest
-from absl import flags
-
-# Compilation takes most of the tests' time. Therefore LLVM does not optimize, and the older
-# fusion emitters are used, which compile several times as fast (jaxlib 0.11 has removed them
-# and aborts on the flag). `import jax` reads the variable. With XLA_FLAGS= in the
-# environment, as in some of CI's slow tests, XLA compiles with its default settings.
-os.environ.setdefault(
-    "XLA_FLAGS",
-    "--xla_backend_optimization_level=0"
-    + " --xla_cpu_use_fusion_emitters=false"
-    * (importlib.metadata.version("jaxlib") < "0.11"),
-)
+from typing import Any
 
 import jax
+import numpy as np
+import pytest
+from absl import flags
 
 # Functions that several tests or processes compile are compiled once per session; the
 # workers of pytest-xdist inherit the folder.
@@ -33,19 +23,32 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
 jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
 _CACHED_FROM_SECS = 0.2
 jax.config.update("jax_persistent_cache_min_compile_time_secs", _CACHED_FROM_SECS)
-jax.config.update("jax_platforms", "cpu")
 jax.config.update("jax_num_cpu_devices", 8)
 jax.config.update("jax_numpy_rank_promotion", "raise")
 # grain's multiprocess prefetch reads an absl flag.
 flags.FLAGS.mark_as_parsed()
 
 SHARED = pathlib.Path(__file__).resolve().parents[2] / "shared"
-GOLDEN = pathlib.Path(__file__).resolve().parent / "golden"
+TESTS = pathlib.Path(__file__).resolve().parent
+GOLDEN = TESTS / "golden"
+
+NUMERICAL = (
+    *("models", "losses", "detection", "geometry", "weights"),
+    *("data/test_projection.py", "training/test_state.py", "training/test_step.py"),
+    "inference/test_detector.py",
+)
+"""Tests whose results depend on the device; an accelerator runs only these."""
 
 
 def pytest_addoption(
     parser: pytest.Parser, pluginmanager: pytest.PytestPluginManager
 ) -> None:
+    parser.addoption(
+        "--platform",
+        choices=["cpu", "cuda", "tpu"],
+        default="cpu",
+        help="where to run; an accelerator runs the numerical tests only",
+    )
     parser.addoption(
         "--shapes",
         action="store_true",
@@ -64,6 +67,41 @@ _GRACE_SECS = 60.0
 
 def pytest_configure(config: pytest.Config) -> None:
     config.stash[_STDERR] = os.dup(2)  # before pytest captures the output
+    _set_up_jax(config.getoption("platform"))
+
+
+# Compilation takes most of the tests' time. Therefore LLVM does not optimize, and the older
+# fusion emitters are used, which compile several times as fast (jaxlib 0.11 has removed them
+# and aborts on the flag). On a GPU, no algorithm is chosen by timing. With XLA_FLAGS= in the
+# environment, as in some of CI's slow tests, XLA compiles with its default settings.
+_FAST_ON_CPU = "--xla_backend_optimization_level=0" + (
+    " --xla_cpu_use_fusion_emitters=false"
+    * (importlib.metadata.version("jaxlib") < "0.11")
+)
+_FAST_ON_GPU = "--xla_gpu_autotune_level=0"
+
+
+def _set_up_jax(platform: str) -> None:
+    """Selects the platform. JAX reads all of this when a device is first used.
+
+    Raises:
+        pytest.UsageError: JAX finds no such accelerator.
+    """
+    if platform == "cpu":
+        os.environ.setdefault("XLA_FLAGS", _FAST_ON_CPU)
+        jax.config.update("jax_platforms", "cpu")
+        return
+    os.environ.setdefault("XLA_FLAGS", _FAST_ON_GPU)
+    # Processes share the memory.
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    jax.config.update("jax_platforms", f"{platform},cpu")
+    # The default of a GPU is TF32, that of a TPU bfloat16: 1e-3 and more from the golden files.
+    jax.config.update("jax_default_matmul_precision", "highest")
+    if jax.default_backend() == "cpu":
+        raise pytest.UsageError(
+            f"--platform {platform}: JAX finds no such device, only "
+            f"{jax.devices()[0].device_kind}; install radejax[{platform}]"
+        )
 
 
 @pytest.hookimpl(wrapper=True)
@@ -89,6 +127,15 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
 def pytest_collection_modifyitems(
     config: pytest.Config, items: list[pytest.Item]
 ) -> None:
+    places = [TESTS / name for name in NUMERICAL]
+    for item in items:
+        is_within = not {item.path, *item.path.parents}.isdisjoint(places)
+        if is_within and not item.get_closest_marker("cpu_only"):
+            item.add_marker("numerical")
+    if config.getoption("platform") != "cpu":
+        others = [x for x in items if not x.get_closest_marker("numerical")]
+        config.hook.pytest_deselected(items=others)
+        items[:] = [x for x in items if x.get_closest_marker("numerical")]
     if config.getoption("shapes"):
         if "--shapes" not in config.invocation_params.args:
             raise pytest.UsageError("--shapes must be on the command line itself")
@@ -115,6 +162,27 @@ def _process_as_it_was() -> Iterator[None]:
     yield
     _reset_log()
     jax.config.update("jax_persistent_cache_min_compile_time_secs", _CACHED_FROM_SECS)
+
+
+@pytest.fixture(autouse=True)
+def _tolerances(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Make the tolerances of arrays ten times as wide on an accelerator.
+
+    They were chosen on CPUs. An accelerator adds in another order, and its elementary functions
+    differ in the last bits. TF32 would still be noticed, with errors of a hundred times these.
+    """
+    if request.config.getoption("platform") == "cpu":
+        return
+    on_cpu = np.testing.assert_allclose  # chex calls it too
+
+    def wider(
+        actual: Any, desired: Any, rtol: float = 1e-7, atol: float = 0.0, **options: Any
+    ) -> None:
+        on_cpu(actual, desired, 10 * rtol, 10 * atol, **options)
+
+    monkeypatch.setattr(np.testing, "assert_allclose", wider)
 
 
 @pytest.fixture

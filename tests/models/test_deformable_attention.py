@@ -250,6 +250,7 @@ def test_bins_without_a_query_get_zero():
     assert out[:, 4].any()
 
 
+@pytest.mark.cpu_only
 def test_memory_follows_the_chunk():
     shapes = {
         "feature": (1, 4096, C),

@@ -129,6 +129,7 @@ def plain(tiny: Tiny, start: Any) -> tuple[Any, Any, Any]:
     return optimizer, state, jax.jit(_make(tiny, optimizer))
 
 
+@pytest.mark.cpu_only
 @pytest.mark.parametrize("parameters", ["replicated", "fsdp"])
 def test_eight_devices_equal_one(tiny: Tiny, plain: Any, parameters: str) -> None:
     optimizer, state, step = plain
