@@ -148,8 +148,10 @@ def test_devices_share_the_work_of_a_step_and_send_only_gradients(
     chex.assert_trees_all_close(actual.params, expected.params, rtol=1e-4, atol=1e-5)
 
 
+# For a transformer that is trained, XLA also gathers the tokens of one layer, to compute the
+# gradient of its kernel. At this size the tokens are as small as the kernel.
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["radenet", "dinorade", "dinorade_resnet50"])
 def test_only_parameters_are_gathered_if_they_are_split(kind: str) -> None:
     program, arguments = _compiled(kind, 4, "fsdp")
     moved = _moved(program)
