@@ -399,7 +399,7 @@ def element_pairs(
 def _beams(
     received: Float[jax.Array, "DM N2"],
     elevation_basis: Float[np.ndarray, "E M"],
-    azimuth_basis: Float[np.ndarray, "A N"],
+    azimuth_basis: Float[Array, "A N"],
 ) -> Float[jax.Array, "E D 2 A"]:
     """Computes real and imaginary part of every bin from the signals of the arrays."""
     (num_elevation, m), (_, n) = elevation_basis.shape, azimuth_basis.shape
