@@ -163,11 +163,9 @@ class Detector:
         self.replicated = self.sharding
         run = self.detect_function()
         if isinstance(self.sharding, NamedSharding):
-            mesh, frames, whole = (
-                self.sharding.mesh,
-                self.sharding.spec,
-                PartitionSpec(),
-            )
+            mesh = self.sharding.mesh
+            frames = self.sharding.spec
+            whole = PartitionSpec()
             self.replicated = NamedSharding(mesh, whole)
             # Each device computes its own frames. Partitioned by XLA, it would search the
             # peaks of all frames.
