@@ -8,6 +8,7 @@ import functools
 import itertools
 import os
 import pathlib
+import signal
 import subprocess
 import sys
 import tempfile
@@ -96,7 +97,8 @@ def until(texts, arguments, folder, programs):
                 break
             end = place + len(text)
             seconds.append(time.perf_counter() - began)
-    process.kill()
+    # `Popen.kill` would take the exit status, and with it the CPU time, of an ended process.
+    os.kill(process.pid, signal.SIGKILL)
     _, process.returncode, usage = os.wait4(process.pid, 0)
     process.stdout.close()
     if len(seconds) < len(texts):

@@ -250,6 +250,10 @@ class Checkpoints:
             description = found["description"]
             if description.pop("sha256") != _text_checksum(description):
                 raise DataError("the checksum of its description differs")
+            # orbax returns what was asked for where its metadata lack an array.
+            leaves = jax.tree.leaves(found["state"])
+            if any(isinstance(leaf, jax.ShapeDtypeStruct) for leaf in leaves):
+                raise DataError("an array is missing")
         # On corrupted files, orbax, tensorstore and json raise errors of any type.
         except Exception as error:
             raise self._corrupted(step, one_line(error)) from error

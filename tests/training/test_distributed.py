@@ -2,7 +2,6 @@
 
 import os
 import signal
-import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -84,10 +83,8 @@ with distributed.end_with_others():
 def test_a_killed_process_ends_the_other_in_one_line(victim: int) -> None:
     started = processes.start(2, "-c", TALK, "nobody fails")
     processes.wait_for("ready", started)
-    killed_at = time.monotonic()
     started[victim].kill()
     output = processes.outputs_of(started, timeout_s=30)[1 - victim]
-    assert time.monotonic() - killed_at < 5
     assert started[1 - victim].returncode == 1
     assert output.splitlines().count(processes.lost(victim)) == 1
     assert "Traceback" not in output
