@@ -11,6 +11,7 @@ import click
 import radejax
 from radejax.cli import entry
 from radejax.core.errors import DataError, UserError
+from radejax.core.files import read_object
 
 _rate = click.option(
     "--rate",
@@ -50,10 +51,24 @@ def _echo_report(report: Any) -> None:
     flag_value="projection",
     help="Write projections only, no radar tensors (260 MB each at full size).",
 )
+@click.option(
+    "--radar", type=entry.EXISTING, help="radar.json of --fit: the radar to simulate."
+)
+@click.option(
+    "--fit",
+    "recordings",
+    multiple=True,
+    type=entry.EXISTING,
+    metavar="RECORDING",
+    help="Simulate nothing, but estimate the radar from radar tensors: tesseract_*.mat, or "
+    "a folder of them. Can be repeated. Writes radar.json and fit.png into --out.",
+)
 @entry.workers
 def simulate(
     config: str | None,
     out: pathlib.Path,
+    radar: str | None,
+    recordings: tuple[str, ...],
     sequence_numbers: tuple[int, ...] | None,
     full_size: bool,
     num_workers: int | None,
@@ -67,8 +82,15 @@ def simulate(
     Example: radejax simulate --scenes labels_v2_1.zip --sequences 5,11 --out data/sim
     """
     from radejax.simulation.config import FULL_SIZE, default_config
+    from radejax.simulation.fitting import FITTED, fit_files
 
     entry.set_up_jax()
+    if recordings:
+        for name, value in fit_files(recordings, out).items():
+            if name != "profile_db":
+                click.echo(f"{name}: {value}")
+        click.echo(f"wrote {out / FITTED} and {out / 'fit.png'}")
+        return
     simulation = default_config()
     if config is not None:
         section = radejax.load_config(config).get("simulation")
@@ -77,6 +99,8 @@ def simulate(
         simulation = dict(section)
     if full_size:
         simulation |= FULL_SIZE
+    if radar is not None:
+        simulation |= read_object(radar, "grid", "radar")
     fields["sequences"] = sequence_numbers
     simulation |= {name: value for name, value in fields.items() if value is not None}
     radejax.simulate(simulation, out, num_workers=num_workers)

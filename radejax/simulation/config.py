@@ -210,7 +210,7 @@ class SimulationConfig:
 
     def make_parameters(self) -> RadarParameters:
         """Returns the parameters of the radar other than its axes."""
-        given = dict(self.radar)
+        given = plain(self.radar)
         preset = given.pop("preset")
         name = "config.simulation.radar.preset"
         require(preset in PRESETS, name, preset, f"one of {', '.join(PRESETS)}")

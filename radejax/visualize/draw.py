@@ -13,7 +13,7 @@ as such.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -97,6 +97,35 @@ def draw_map(
         cax = ax.inset_axes((1.02, 0.0, 0.035, 1.0))
         ax.figure.colorbar(mesh, cax=cax, label=label)
     return ax
+
+
+def draw_comparison(
+    maps: Mapping[str, Float[np.ndarray, "R A"]], grid: RadarGrid
+) -> Figure:
+    """Draw range-azimuth maps of several recordings, their profiles and strongest echoes.
+
+    Args:
+        maps: Mean power in dB by title.
+        grid: Sensor axes of all maps.
+    """
+    figure = style.new_figure(5.0 * len(maps) + 4.0, 5.2, layout="constrained")
+    layout = figure.add_gridspec(2, len(maps) + 1)
+    profile, beams = (figure.add_subplot(layout[row, -1]) for row in range(2))
+    limits = style.color_limits_of(np.stack(list(maps.values())))
+    azimuth_deg = np.rad2deg(grid.azimuth_rad)
+    for column, (title, level) in enumerate(maps.items()):
+        ax = figure.add_subplot(layout[:, column])
+        draw_map(level, grid, ax=ax, color_limits=limits, label="mean power [dB]")
+        ax.set_title(title)
+        profile.plot(grid.range_m, np.median(level, axis=1), lw=1.0, label=title)
+        is_far = grid.range_m > min(10.0, grid.range_m[-1] / 2.0)
+        above = np.where(is_far[:, None], level - np.median(level, 1)[:, None], -np.inf)
+        row = level[np.unravel_index(above.argmax(), above.shape)[0]]
+        beams.plot(azimuth_deg, row - row.max(), lw=1.0, label=title)
+    profile.set(xlabel="range [m]", ylabel="median over azimuth [dB]")
+    beams.set(xlabel="azimuth [degrees]", ylabel="row of the strongest echo [dB]")
+    profile.legend(fontsize=7)
+    return figure
 
 
 def draw_bev(scene: Scene, *, color_limits: tuple[float, float] | None = None) -> Axes:

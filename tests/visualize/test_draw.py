@@ -197,3 +197,21 @@ def test_one_strong_echo_does_not_darken_the_maps() -> None:
     figure = draw_scenes([scene])
     (mesh,) = figure.axes[0].findobj(QuadMesh)
     assert mesh.get_clim()[1] < 0.5
+
+
+def test_a_comparison_shows_maps_on_one_scale_and_the_strongest_echo_of_each() -> None:
+    first = np.random.default_rng(0).normal(100.0, 0.2, GRID.projection_shape[:2])
+    second = first + 3.0
+    second[40, 20] = 130.0
+    figure = draw.draw_comparison({"recorded": first, "simulated": second}, GRID)
+    maps = [ax for ax in figure.axes if ax.get_title() in ("recorded", "simulated")]
+    scales = {ax.collections[0].get_clim() for ax in maps}
+    assert len(maps) == 2
+    assert len(scales) == 1
+    profile, beams = (
+        ax for ax in figure.axes if ax.get_xlabel().startswith(("range", "azimuth"))
+    )
+    low, high = (np.median(line.get_ydata()) for line in profile.lines)
+    assert high - low == pytest.approx(3.0)
+    row = beams.lines[1].get_ydata()
+    assert (row.argmax(), row.max()) == (20, 0.0)

@@ -44,13 +44,23 @@ _FAR_PROFILE = np.array(
 """Fraction of the maximum range, and noise as in `_NEAR_PROFILE`."""
 
 
+LEAK_M = 5.0
+"""Distance up to which the direct leak raises the noise."""
+
+LEAK_SHARE = 0.97
+"""Fraction of the maximum range from which on it does."""
+
+
 def receiver_noise(
     grid: RadarGrid, parameters: RadarParameters
 ) -> Float[np.ndarray, "R D"]:
     """Computes the mean power of the receiver's noise and of the direct leak."""
     range_m = grid.range_m
-    profile_db = np.interp(range_m, *_NEAR_PROFILE.T)
-    profile_db += np.interp(range_m / range_m[-1], *_FAR_PROFILE.T)
+    if parameters.profile_db:
+        profile_db = np.interp(range_m, *np.array(parameters.profile_db).T)
+    else:
+        profile_db = np.interp(range_m, *_NEAR_PROFILE.T)
+        profile_db += np.interp(range_m / range_m[-1], *_FAR_PROFILE.T)
     factor = 10.0 ** (parameters.range_profile * profile_db / 10.0)
     is_still = np.zeros(max(grid.num_doppler, 1))
     is_still[np.abs(grid.doppler_mps).argmin() if grid.num_doppler else 0] = 1.0
@@ -88,12 +98,7 @@ def draw_state(
     window = np.hanning(11)
     white = rng.normal(size=grid.num_azimuth + 10)
     spread = np.convolve(white, window, "valid") / np.linalg.norm(window)
-    # A filter (c, 1, c) gives fields of neighboring bins, which are the roots of their
-    # powers, a correlation of 2 c / (1 + 2 c^2).
-    side, pedestal = 0.0, 0.0
-    if correlation:
-        side = (1.0 - np.sqrt(1.0 - 2.0 * correlation)) / (2.0 * np.sqrt(correlation))
-        pedestal = (1.0 - 2.0 * side) / (1.0 + 2.0 * side)
+    side, pedestal = noise_window(correlation) if correlation else (0.0, 0.0)
     return SensorState(
         azimuth_phase_rad=azimuth,
         elevation_phase_rad=elevation,
@@ -101,6 +106,23 @@ def draw_state(
         range_pedestal=np.array(pedestal, np.float32),
         range_side=np.array(side, np.float32),
     )
+
+
+def noise_window(correlation: float) -> tuple[float, float]:
+    """Computes the window whose noise power is correlated between neighboring bins.
+
+    A filter (c, 1, c) gives fields of neighboring bins, whose correlation is the root of
+    that of their powers, a correlation of 2 c / (1 + 2 c^2).
+
+    Args:
+        correlation: Correlation of the noise power, from 0 (uniform) to 4/9 (Hann window).
+
+    Returns:
+        The coefficient c, and the pedestal of the window.
+    """
+    root = np.sqrt(correlation)
+    side = root / (1.0 + np.sqrt(1.0 - 2.0 * correlation))
+    return float(side), float((1.0 - 2.0 * side) / (1.0 + 2.0 * side))
 
 
 def _phase_errors(

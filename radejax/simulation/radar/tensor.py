@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 from typing import Any, Literal
 
 import jax
@@ -35,6 +36,14 @@ TESSERACT_OF_ROWS = (2, 0, 1, 3)
 """Permutation of the axes from rows `[R, E, D, A]` to a tesseract `[D, R, E, A]`."""
 
 
+def _is_profile(points: Any) -> bool:
+    """Returns True for pairs of a range in m and a level in dB, at ascending ranges."""
+    (is_range, _), (is_level, _) = number(0), number(-200, 200)
+    return all(
+        len(pair) == 2 and is_range(pair[0]) and is_level(pair[1]) for pair in points
+    ) and all(near[0] < far[0] for near, far in itertools.pairwise(points))
+
+
 _DRAWN_RANGES = {
     "gain_db": number(-1e3, 1e3),
     "noise_db": number(-1e3, 1e3),
@@ -48,6 +57,7 @@ _DRAWN_RANGES = {
 }
 _RANGES = _DRAWN_RANGES | {
     "gain_doppler_bins": integer(0),
+    "profile_db": (_is_profile, "pairs of range in m and level in dB, by range"),
     "wavelength_m": number(1e-4, 1),
     "azimuth_elements": number(1, 512),
     "elevation_elements": number(1, 512),
@@ -81,6 +91,8 @@ class RadarParameters:
         range_profile: Factor on the profile over range in dB that K-Radar's noise has: the
             direct leak into the first bins, a dip, a decay before the last bins and a rise
             in them. 0 for noise of the same power at all ranges.
+        profile_db: Range in m and noise in dB relative to `noise_db` at ascending ranges,
+            as `fit_radar` estimates them; empty for the profile of K-Radar.
         high_pass_m: Range below which the receiver's high-pass filter attenuates echoes by
             40 dB per decade, as much as echoes become stronger; 0 for no filter.
         leakage: Mean power of an echo in beams away from it, relative to its peak. It is
@@ -114,6 +126,7 @@ class RadarParameters:
     noise_db: float = 95.0
     receiver_db: float = 0.0
     range_profile: float = 0.0
+    profile_db: tuple[tuple[float, float], ...] = ()
     high_pass_m: float = 0.0
     leakage: float = 0.0
     range_correlation: float = 0.0
