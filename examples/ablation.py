@@ -22,9 +22,10 @@ the tables of the finished runs. Several processes with the same command share t
 each its own core (`taskset -c 0 python ...`).
 
 AP is BEV at IoU 0.3 with the protocol `all_point`, averaged over the seeds. The 95 % intervals are
-from paired resamples of the held-out sequences and do not count the variance between seeds. A claim
-is supported if the interval lies above 0 and the difference reaches the claimed one, and not
-reproduced if the interval ends below that. Both hold for simulated data only.
+those of `radejax compare`: from paired resamples of the held-out sequences and, with three seeds or
+more, the variance between seeds. A claim is supported in simulation if the interval lies above 0
+and the difference reaches the claimed one, and not reproduced in simulation if the interval ends
+below that.
 """
 
 from __future__ import annotations
@@ -58,15 +59,11 @@ from radejax.core.structures import CLASSES
 from radejax.data.kradar.dataset import read_split
 from radejax.data.kradar.reduce import reduce_dataset
 from radejax.data.kradar.write import write_splits
+from radejax.evaluation.comparison import difference
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files import Source, load
 from radejax.evaluation.report import rendered
-from radejax.evaluation.results import (
-    interval,
-    repair_sizes,
-    resample,
-    sequence_weights,
-)
+from radejax.evaluation.results import repair_sizes, resample, sequence_weights
 from radejax.runs import experiment
 from radejax.runs.evaluate import evaluate_run
 from radejax.simulation.dataset import simulate_dataset
@@ -253,13 +250,17 @@ def conditions(work: Work, frames: Mapping[str, Any]) -> dict[str, np.ndarray]:
     return {n: mask for n, mask in found.items() if len(set(sequence[mask])) > 1}
 
 
+_SEQUENCES = "sequences "
+
+
 def resampled(
     work: Work, name: str, seed: int, resamples: int
 ) -> dict[str, np.ndarray]:
     """Returns the APs `[1 + B, C + 1]` in percent of a run by condition.
 
     The first row is over all sequences, the others are over resamples. The last column is the mean
-    over the classes. The result is cached in the folder of the evaluation.
+    over the classes. "sequences CONDITION" has the number of sequences of each condition. The
+    result is cached in the folder of the evaluation.
     """
     path = work.report(name, seed) / f"resampled_{resamples}.npz"
     if path.exists():
@@ -279,6 +280,7 @@ def resampled(
             data.of_frames(mask), weights, "all_point", "bev", 0.3, score_threshold=cut
         )
         result[condition] = aps.astype(np.float32)
+        result[f"{_SEQUENCES}{condition}"] = np.array(len(set(sequence[mask])))
     with files.atomic_write(path) as file:
         np.savez_compressed(file, **result)
     return result
@@ -308,9 +310,9 @@ class Comparer:
         """Returns the seeds for which all of the named variants are finished."""
         return [s for s in self.seeds if all(self.work.is_done(n, s) for n in names)]
 
-    def mean(self, name: str, seeds: list[int], condition: str) -> np.ndarray:
-        """Returns the APs `[1 + B, C + 1]` of `resampled`, averaged over the seeds."""
-        return np.mean([self.samples(name, s)[condition] for s in seeds], axis=0)
+    def aps(self, name: str, seeds: list[int], condition: str) -> np.ndarray:
+        """Returns the APs `[N, 1 + B, C + 1]` of `resampled` of all seeds."""
+        return np.stack([self.samples(name, s)[condition] for s in seeds])
 
     def rows(self) -> Iterator[dict[str, Any]]:
         """Yields the AP of each variant, condition and class, and its difference to the base."""
@@ -320,11 +322,14 @@ class Comparer:
                 continue
             both = self.done(name, base)
             for condition in self.samples(name, seeds[0]):
-                whole = self.mean(name, seeds, condition)[0]
+                if condition.startswith(_SEQUENCES):
+                    continue
+                whole = self.aps(name, seeds, condition)[:, 0]
                 for index, cls in enumerate((*CLASSES, "mean")):
                     row = {"cell": name, "seeds": seeds, "condition": condition}
-                    row |= {"cls": cls, "ap": float(whole[index])}
-                    if both and name != base and not np.isnan(whole[index]):
+                    row |= {"cls": cls, "ap": float(whole[:, index].mean())}
+                    row["ap_by_seed"] = whole[:, index].tolist()
+                    if both and name != base and not np.isnan(row["ap"]):
                         row |= self.gap(name, base, cls, condition)
                     yield row
 
@@ -332,10 +337,11 @@ class Comparer:
         """Returns the difference a - b of a class and its interval; empty without common seed."""
         if not (seeds := self.done(a, b)):
             return {}
-        ap_a, ap_b = (self.mean(name, seeds, condition) for name in (a, b))
-        gaps = (ap_a - ap_b)[:, (*CLASSES, "mean").index(cls)]
-        low, high = interval(gaps[1:])
-        return {"difference": float(gaps[0]), "low": low, "high": high}
+        index = (*CLASSES, "mean").index(cls)
+        ap_a, ap_b = (self.aps(n, seeds, condition)[..., index] for n in (a, b))
+        count = int(self.samples(a, seeds[0])[f"{_SEQUENCES}{condition}"])
+        _, _, gap, _, low, high, _ = difference(ap_b, ap_a, True, count)
+        return {"difference": gap, "low": low, "high": high}
 
     def claims(self) -> Iterator[dict[str, Any]]:
         """Yields the study's claims with difference, interval and verdict."""

@@ -15,7 +15,7 @@ _VARIANTS = load_module(CONFIGS / "radenet.py").VARIANTS
 _RELEASES = load_module(CONFIGS / "radenet.py").RELEASES
 _RADAR = "quickstart:ablation"
 _LABELS = {"data.label_permutation_seed": 0}
-_OWN_INPUT = {"model.input_center": 0.545, "model.input_scale": 25.0}
+_OWN_INPUT = {"model.input_center": 0.64, "model.input_scale": 14.0}
 """Centering and scaling of the input in `configs/quickstart.py`."""
 
 

@@ -24,6 +24,7 @@ from radejax.core.structures import CLASSES
 from radejax.data.points import local_mean_db
 from radejax.data.projection import LOG_OFFSET_DB, LOG_SCALE_DB
 from radejax.geometry.radar_grid import RadarGrid
+from radejax.simulation.radar.sensor import high_pass
 from radejax.simulation.radar.tensor import RadarParameters
 from radejax.simulation.world.traffic import SIZES
 
@@ -130,7 +131,9 @@ def object_rcs_db(
 
 def apparent_rcs_db(power_db, range_m, parameters: RadarParameters):
     """Returns the RCS in dBsm of a bin's power in dB; ranges below 1 m count as 1 m."""
-    return power_db - parameters.gain_db + 40.0 * np.log10(np.maximum(range_m, 1.0))
+    range_m = np.maximum(range_m, 1.0)
+    law = high_pass(range_m, parameters.high_pass_m) / range_m**4
+    return power_db - parameters.gain_db - 10.0 * np.log10(law)
 
 
 def _power_db(projection: np.ndarray, grid: RadarGrid) -> np.ndarray:

@@ -34,8 +34,9 @@ from radejax.evaluation.report import Report, write_report
 from radejax.evaluation.results import EvaluationOptions
 from radejax.simulation.radar.tensor import RadarParameters
 
-# Another gain would shift all cross-sections and the fitted limits by the same amount.
-PARAMETERS = RadarParameters()
+# The middle of the ranges of the realistic radar. Another gain would shift all cross-sections and
+# the fitted limits by the same amount.
+PARAMETERS = RadarParameters(gain_db=202.0, high_pass_m=15.0)
 
 
 def run_baseline(

@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from radejax.core.structures import CLASSES
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibration
-from radejax.simulation.radar.tensor import RadarParameters
+from radejax.simulation.config import SimulationConfig
 from radejax.simulation.simulator import SequenceSimulator
 from radejax.simulation.world.traffic import make_sequence
 from radejax.visualize.style import (
@@ -35,8 +35,9 @@ SCENES = (
 )
 OFFSET = (-2.54, 0.3, 0.7)
 GRID = RadarGrid.kradar()
-LIMITS_DB = (96, 130)  # from the noise to the echoes of cars
-ANGLE_LIMITS_DB = (96, 150)  # the maximum over ranges comes mostly from near objects
+PARAMETERS = SimulationConfig(grid="kradar", radar={}).make_parameters()
+LIMITS_DB = (112, 145)  # from the noise to the echoes of cars
+ANGLE_LIMITS_DB = (115, 160)  # the maximum over ranges comes mostly from near objects
 SEEN = {"color": "white", "lw": 1.0, "ls": "-"}
 UNSEEN = {"color": "#E69F00", "lw": 1.2, "ls": (0, (3, 1))}
 
@@ -47,7 +48,7 @@ def draw(weather, environment, time, seed, path):
         seed, environment=environment, time=time, weather=weather, num_frames=60,
         rng=np.random.default_rng(seed),
     )  # fmt: skip
-    simulator = SequenceSimulator(sequence, GRID, RadarParameters(), seed)
+    simulator = SequenceSimulator(sequence, GRID, PARAMETERS, seed)
     frame = sequence.frame(30)
     given = simulator.radar_input(frame)
     power_db = 10 * np.log10(simulator.run(given, "tesseract") + 1e-10)  # [D, R, E, A]

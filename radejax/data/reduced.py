@@ -51,7 +51,7 @@ EMPTY_LEVEL = 0.5
 """Level of bins without a point, a little below K-Radar's noise."""
 
 _MAX_POWER = 1e6  # far above any echo divided by POWER_UNIT, far below undivided noise
-_MIN_DECIBELS = 60.0  # undivided noise is above
+_MIN_DECIBELS, _MAX_DECIBELS = 60.0, 300.0  # undivided noise is above, echoes are below
 
 _KRADAR_DOPPLER_MPS = np.linspace(-1.932591218305504, 1.872197742733457, 64)
 """K-Radar's Doppler axis, of which `RadarGrid.kradar` has six decimals."""
@@ -310,7 +310,8 @@ def _check_power(power: Float[np.ndarray, "..."], name: str) -> None:
     share = 0.0 if low else np.mean(power == 0)
     # Powers of all cells differ by more than a factor of 2, logarithms of them by less.
     is_whole = power.ndim == 3 and power.size > 1_000
-    is_log = 0 < low <= high < 2 * low and (is_whole or low > _MIN_DECIBELS)
+    is_log = 0 < low <= high < 2 * low
+    is_log &= is_whole or _MIN_DECIBELS < low < _MAX_DECIBELS
     if not 0 <= low <= high <= _MAX_POWER or is_log or share > MAX_ZERO_SHARE:
         raise DataError(
             f"{name}: powers from {low:.3g} to {high:.3g}, {share:.0%} of them 0; expected "

@@ -155,7 +155,7 @@ def compare(
             for index, cls in enumerate((*classes, "mean")[: len(classes) ** 2]):
                 a, b = np.split(aps[..., index], [len(run_a)])
                 if not np.isnan(a[0, 0]):
-                    values = _difference(a, b, is_paired, np.unique(of_frame).size)
+                    values = difference(a, b, is_paired, np.unique(of_frame).size)
                     rows.append(Comparison(kind, condition, cls, *shown, *values))
     is_tested = min(len(run_a), len(run_b)) >= MIN_SEEDS
     adjusted, least = list[Comparison](), 0.0
@@ -171,8 +171,11 @@ def compare(
     return adjusted
 
 
-def _difference(a: Aps, b: Aps, is_paired: bool, num_sequences: int) -> tuple[Any, ...]:
-    """Returns both APs, their difference, its deviation, interval and p-value.
+def difference(a: Aps, b: Aps, is_paired: bool, num_sequences: int) -> tuple[Any, ...]:
+    """Computes both APs, their difference, its deviation, interval and p-value.
+
+    With `MIN_SEEDS` seeds or more of both runs, the interval counts the variance between
+    seeds, see the docstring of the module.
 
     Args:
         a: `[N, 1+B]` APs of the seeds of run A. The first column is over all frames, the others are
@@ -180,6 +183,9 @@ def _difference(a: Aps, b: Aps, is_paired: bool, num_sequences: int) -> tuple[An
         b: `[M, 1+B]` APs of run B in the same way.
         is_paired: Whether row i of both runs has the same seed.
         num_sequences: Number of sequences.
+
+    Returns:
+        The fields of `Comparison` from `ap_a` to `p_value`.
     """
     gaps = b.mean(axis=0) - a.mean(axis=0)
     aps = float(a[:, 0].mean()), float(b[:, 0].mean()), float(gaps[0])

@@ -55,9 +55,9 @@ class RadeNet(nn.Module):
         remat: One of `REMAT`, to save memory in the backward pass by recomputation.
         heatmap_prior: Score of bins in an untrained model; see `radejax.models.heads.Heads`.
         input_center: Value subtracted from the projection; 0 in the paper. Noise is about
-            0.545.
+            0.63.
         input_scale: Factor applied after the subtraction; 1 in the paper. An echo 10 dB
-            above the noise differs from it by 0.054, and with a factor of 25 by 1.4, which
+            above the noise differs from it by 0.054, and with a factor of 20 by 1.1, which
             is a usual magnitude of a network's input.
         num_frames: Number of frames whose channels form the input, see
             `radejax.data.projection.stack_frames`.

@@ -36,7 +36,7 @@ from radejax.training import distributed
 _log = logging.getLogger(__name__)
 
 _INPUT_FRAMES = 20
-_KRADAR_INPUT = 0.545  # mean of K-Radar's projections
+_KRADAR_INPUT = 0.63  # mean of projections with the noise of K-Radar's public map
 
 
 class Data:

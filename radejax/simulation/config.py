@@ -54,7 +54,7 @@ _RANGES = {
     "radar_from_lidar_m": errors.several(number(-math.inf), "three numbers", 3),
 }
 
-DEFAULT_PRESET = "ideal"
+DEFAULT_PRESET = "realistic"
 """Entry of `PRESETS` that `simulation.radar` extends if it does not name one as `preset`."""
 
 PRESETS: dict[str, dict[str, Any]] = {

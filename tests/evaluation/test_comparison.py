@@ -188,7 +188,7 @@ def test_at_most_5_percent_of_equal_configs_differ(of_seeds, is_paired):
     p_values, covered = [], []
     for _ in range(1000):
         a, b = drawn_aps(rng, of_seeds)
-        *_, low, high, p_value = comparison._difference(a, b, is_paired, 12)
+        *_, low, high, p_value = comparison.difference(a, b, is_paired, 12)
         p_values.append(p_value)
         covered.append(low <= 0 <= high)
     # 1,000 draws have a standard error of 0.7 %.
@@ -201,7 +201,7 @@ def test_at_most_5_percent_of_equal_configs_differ(of_seeds, is_paired):
 def test_a_gain_is_printed_with_its_deviation_and_paired_by_seed():
     a = np.array([[50.0], [53.0], [59.0]]) + np.array([0, -1, 1, -2, 2])
     b = a + np.array([[3.0], [4.0], [5.0]])
-    ap_a, ap_b, gain, std, low, high, p_value = comparison._difference(a, b, True, 9)
+    ap_a, ap_b, gain, std, low, high, p_value = comparison.difference(a, b, True, 9)
     assert (ap_a, ap_b, gain, std) == pytest.approx((54, 58, 4, 1))
     # The sequences add nothing, so that it is the t-test of three pairs.
     assert (low, high) == pytest.approx(
@@ -210,11 +210,11 @@ def test_a_gain_is_printed_with_its_deviation_and_paired_by_seed():
     assert p_value == pytest.approx(
         scipy.stats.ttest_1samp([3, 4, 5], 0).pvalue, rel=0.01
     )
-    *_, std, low, high, p_value = comparison._difference(a, b, False, 9)
+    *_, std, low, high, p_value = comparison.difference(a, b, False, 9)
     assert std == pytest.approx((21 + np.var(b[:, 0], ddof=1)) ** 0.5)
     assert p_value > 0.3
     a[:, 1:] = b[:, 1:] = np.nan  # the class is in no resample
-    *_, low, high, p_value = comparison._difference(a, b, True, 9)
+    *_, low, high, p_value = comparison.difference(a, b, True, 9)
     assert np.isnan([low, high, p_value]).all()
 
 
