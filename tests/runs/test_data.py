@@ -106,11 +106,11 @@ def test_frames_are_projected_beside_their_data_once(
     config.train.batch_size = 4
     with caplog.at_level("INFO", "radejax"):
         data = _open(config)
-        assert re.search(r"input: 0\.54\d ± 0\.02\d in 4 frames to train", caplog.text)
+        assert re.search(r"input: 0\.64\d ± 0\.04\d in 4 frames to train", caplog.text)
         assert "nearly constant" not in caplog.text
         config.model.input_center = 0.4
         _open(config)
-    assert "set --config.model.input_center=0.54" in caplog.text
+    assert "set --config.model.input_center=0.64" in caplog.text
     assert data.options.roots == (str(root),)
     assert data.options.records == str(root / "records")
     assert len(data.records.keys()) == 6

@@ -141,7 +141,7 @@ class TestRepeating:
         ]
         assert found[0] == found[1] == found[2]
         ideal = simulate_dataset(
-            config | {"radar": {}}, tmp_path / "ideal", progress=False
+            config | {"radar": {"preset": "ideal"}}, tmp_path / "ideal", progress=False
         )
         assert digests(ideal) != found[0]
 

@@ -27,6 +27,7 @@ _QUIET = 3.0  # above the expected maximum of a line; 5 % of lines of pure noise
 _LEAST_SPREAD = 0.1  # averages of 100 powers have it
 _MIN_ECHO_DB = 25.0
 _NUM_ECHOES = 6
+_MIN_LINES = 20
 _NUM_LAGS = 6
 _NUM_PROFILE_POINTS = 32
 _MAX_ELEMENTS = 128
@@ -77,11 +78,11 @@ def _fit_one(power: Float[np.ndarray, "D R E A"], grid: RadarGrid) -> dict[str, 
     quiet = (power.max((2, 3)) < most) & middle  # [D, R]
     num_quiet = int(quiet.sum())
     spread = power[quiet].std() / max(line[quiet].mean(), 1e-30) if num_quiet else 0.0
-    if num_quiet < 100 or spread < _LEAST_SPREAD:
+    if num_quiet < _MIN_LINES or spread < _LEAST_SPREAD:
         raise DataError(
             f"{num_quiet} lines over Doppler and range hold noise alone, whose standard "
-            f"deviation is {spread:.2g} of its mean; expected at least 100 lines and about 1, "
-            "the value of linear power (decibels have less)"
+            f"deviation is {spread:.2g} of its mean; expected {_MIN_LINES} lines or more and about "
+            "1, the value of linear power (decibels have less)"
         )
     noise = line[quiet].mean()
     # Not relative to the mean of each line, which has few independent cells.
