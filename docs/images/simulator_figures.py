@@ -1,4 +1,5 @@
-"""Draws the figures of `docs/simulator.md`: one row of full-size maps per kind of weather.
+"""Draws the figures of `docs/simulator.md`: one row of full-size maps per kind of weather, and the
+statistics of the simulated radar beside those of K-Radar's public map.
 
 python docs/images/simulator_figures.py --out docs/images
 """
@@ -15,6 +16,7 @@ from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibratio
 from radejax.simulation.config import SimulationConfig
 from radejax.simulation.simulator import SequenceSimulator
 from radejax.simulation.world.traffic import make_sequence
+from radejax.visualize.draw import draw_map
 from radejax.visualize.style import (
     COLOR_MAP,
     Label,
@@ -37,8 +39,15 @@ OFFSET = (-2.54, 0.3, 0.7)
 GRID = RadarGrid.kradar()
 PARAMETERS = SimulationConfig(grid="kradar", radar={}).make_parameters()
 LIMITS_DB = (112, 145)  # from the noise to the echoes of cars
-ANGLE_LIMITS_DB = (115, 160)  # the maximum over ranges comes mostly from near objects
+ANGLE_LIMITS_DB = (120, 165)  # the maximum over ranges comes mostly from near objects
 SEEN = {"color": "white", "lw": 1.0, "ls": "-"}
+SIMULATED, REAL = "#0072B2", "#D55E00"
+REAL_PROFILE_DB = {
+    (0, 1): 12.4, (1, 5): 4.4, (5, 10): -3.2, (10, 25): -0.7, (25, 50): 0.0, (50, 75): 0.0,
+    (75, 100): 0.0, (107, 114): -4.1, (114, 119): 1.1,
+}  # fmt: skip
+"""Bands in m and medians of K-Radar's public map, as in the table of `docs/simulator.md`."""
+REAL_LEAKAGE_DB = -15.5
 UNSEEN = {"color": "#E69F00", "lw": 1.2, "ls": (0, (3, 1))}
 
 
@@ -88,7 +97,7 @@ def draw_maps(axes, power_db):
     ground.set_aspect("equal")
     ground.set_facecolor("0.9")
     second = angles.imshow(
-        power_db.max((0, 1)),
+        power_db[:, (GRID.range_m > 5) & (GRID.range_m < 100)].max((0, 1)),
         origin="lower",
         aspect="auto",
         extent=(-53, 53, -18, 18),
@@ -96,6 +105,7 @@ def draw_maps(axes, power_db):
         vmin=ANGLE_LIMITS_DB[0],
         vmax=ANGLE_LIMITS_DB[1],
     )
+    angles.set_title("from 5 to 100 m", fontsize=8)  # without the direct leak
     angles.set(xlabel="azimuth, right positive [deg]", ylabel="elevation [deg]")
     speeds = (GRID.doppler_mps[0], GRID.doppler_mps[-1], 0, GRID.range_m[-1])
     third = doppler.imshow(
@@ -133,8 +143,53 @@ def draw_boxes(axis, frame, is_visible):
     )
 
 
+def draw_statistics(path):
+    """Draw mean power of one frame, and profiles and echoes of all scenes beside K-Radar's."""
+    levels = []
+    for weather, environment, time, seed in SCENES:
+        sequence = make_sequence(
+            seed, environment=environment, time=time, weather=weather, num_frames=2,
+            rng=np.random.default_rng(seed),
+        )  # fmt: skip
+        simulator = SequenceSimulator(sequence, GRID, PARAMETERS, seed)
+        given = simulator.radar_input(sequence.frame(0))
+        power = simulator.run(given, "tesseract").mean((0, 2), dtype=np.float64)
+        levels.append(10 * np.log10(power))
+    figure = new_figure(14, 4, layout="constrained")
+    ground, profile, beams = figure.subplots(1, 3, width_ratios=(1.1, 1.2, 1.2))
+    draw_map(
+        levels[0], GRID, ax=ground, color_limits=(104, 135), label="mean power [dB]"
+    )
+    ground.set_title("simulated map", fontsize=10)
+    range_m, azimuth_deg = GRID.range_m, np.rad2deg(GRID.azimuth_rad)
+    inside = (range_m > 30) & (range_m < 95)
+    for level in levels:
+        row = np.median(level, axis=1)
+        profile.plot(range_m, row - np.median(level[inside]), color=SIMULATED, lw=0.7)
+        above = np.where(inside[:, None], level - row[:, None], 0.0)
+        index, peak = np.unravel_index(above.argmax(), above.shape)
+        echo = 10 ** (level[index] / 10) - 10 ** (np.median(level[inside]) / 10)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            echo_db = 10 * np.log10(np.maximum(echo / echo[peak], 1e-4))
+        beams.plot(azimuth_deg - azimuth_deg[peak], echo_db, color=SIMULATED, lw=0.7)
+    for (low, high), level_db in REAL_PROFILE_DB.items():
+        profile.plot([low, high], [level_db] * 2, color=REAL, lw=3)
+    profile.set(ylim=(-10, 25), xlabel="range [m]", ylabel="relative to the noise [dB]")
+    profile.set_title("median over azimuth", fontsize=10)
+    beams.axhline(REAL_LEAKAGE_DB, color=REAL, lw=3)
+    beams.set(xlim=(-60, 60), ylim=(-30, 1), xlabel="azimuth from the peak [degrees]")
+    beams.set_ylabel("relative to the peak [dB]")
+    beams.set_title(
+        "strongest echo; median leakage of the map", fontsize=10
+    )
+    names = ("simulated, seven scenes", SIMULATED, 1), ("real, one map", REAL, 3)
+    lines = [Line2D([], [], color=c, lw=w, label=name) for name, c, w in names]
+    profile.legend(handles=lines, fontsize=8)
+    figure.savefig(path, dpi=110)
+
+
 def main():
-    """Draw all scenes, or those of the named kinds of weather."""
+    """Draw all scenes, or those of the named kinds of weather, and the statistics."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("docs/images"))
     parser.add_argument("--weather", nargs="*", default=[s[0] for s in SCENES])
@@ -142,6 +197,7 @@ def main():
     for scene in SCENES:
         if scene[0] in given.weather:
             draw(*scene, given.out / f"simulator_{scene[0]}.png")
+    draw_statistics(given.out / "simulator_statistics.png")
 
 
 if __name__ == "__main__":
