@@ -51,11 +51,11 @@ class CfarSettings:
     peak_drop_db: float = 12.0
     merge_m: float = 4.5
     rcs_steps: tuple[tuple[str, float], ...] = (
-        ("Bus or Truck", 9.0),
-        ("Sedan", -5.0),
-        ("Motorcycle", -7.0),
-        ("Bicycle", -9.0),
-        ("Pedestrian", -16.0),
+        ("Bus or Truck", 22.0),
+        ("Sedan", -7.0),
+        ("Motorcycle", -12.7),
+        ("Bicycle", -13.7),
+        ("Pedestrian", -14.7),
     )
 
 

@@ -53,7 +53,11 @@ def test_finds_cars_where_they_are():
     ],
 )
 def test_cross_section_chooses_the_class(rcs_db, cls):
-    found = cfar.detect(projection_of((15.6, 0.0, rcs_db)), GRID, PARAMETERS)
+    limits = (9.0, -5.0, -7.0, -9.0, -16.0)
+    names = ("Bus or Truck", "Sedan", "Motorcycle", "Bicycle", "Pedestrian")
+    settings = cfar.CfarSettings(rcs_steps=tuple(zip(names, limits, strict=True)))
+    projection = projection_of((15.6, 0.0, rcs_db))
+    found = cfar.detect(projection, GRID, PARAMETERS, settings)
     assert found["cls"][0] == cls
 
 
