@@ -179,9 +179,7 @@ def draw_statistics(path):
     beams.axhline(REAL_LEAKAGE_DB, color=REAL, lw=3)
     beams.set(xlim=(-60, 60), ylim=(-30, 1), xlabel="azimuth from the peak [degrees]")
     beams.set_ylabel("relative to the peak [dB]")
-    beams.set_title(
-        "strongest echo; median leakage of the map", fontsize=10
-    )
+    beams.set_title("strongest echo; median leakage of the map", fontsize=10)
     names = ("simulated, seven scenes", SIMULATED, 1), ("real, one map", REAL, 3)
     lines = [Line2D([], [], color=c, lw=w, label=name) for name, c, w in names]
     profile.legend(handles=lines, fontsize=8)
