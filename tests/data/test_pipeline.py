@@ -297,10 +297,12 @@ def test_state_travels_with_an_orbax_checkpoint(loader, tmp_path):
 
 
 class Meeting(Records):
-    """Records that are read only when several threads read one at the same time."""
+    """Records of which the first are read only when all threads read one at that time."""
 
     def __getitem__(self, key):
-        self.source["barrier"].wait(20)
+        barrier = self.source["barrier"]
+        if next(self.source["count"]) < barrier.parties:
+            barrier.wait(20)
         return super().__getitem__(key)
 
 
@@ -312,7 +314,7 @@ def test_all_threads_read_frames_at_the_same_time(
 ):
     """By default as many as there are CPUs, and from the first batch on."""
     barrier = threading.Barrier(num_threads)
-    source = {**records.source, "barrier": barrier}
+    source = {**records.source, "barrier": barrier, "count": itertools.count()}
     meeting = Meeting(records.folder, records.shape, records.dtype, source)
     options = dataclasses.replace(OPTIONS, batch_size=batch_size, num_epochs=2)
     assert options.num_threads is None

@@ -157,10 +157,8 @@ def _num_elements(
     def error(elements: int) -> float:
         basis = array_basis(axis_rad, elements, ARRAY_PEDESTAL)
         expected = np.square(basis @ basis.T)
-        return sum(
-            (np.diag(expected, lag).mean() - wanted) ** 2
-            for lag, wanted in zip(lags, found, strict=True)
-        )
+        errors = [np.diag(expected, lag).mean() for lag in lags] - np.array(found)
+        return float(np.square(errors).sum())
 
     return float(min(range(2, _MAX_ELEMENTS + 1), key=error))
 
