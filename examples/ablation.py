@@ -262,7 +262,7 @@ def resampled(
     over the classes. "sequences CONDITION" has the number of sequences of each condition. The
     result is cached in the folder of the evaluation.
     """
-    path = work.report(name, seed) / f"resampled_{resamples}.npz"
+    path = work.report(name, seed) / f"aps_{resamples}.npz"
     if path.exists():
         with np.load(path) as stored:
             return dict(stored)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import pathlib
 from collections.abc import Sequence
 from typing import Any
@@ -50,11 +51,13 @@ def fit_files(recordings: Sequence[PathLike], out: PathLike) -> dict[str, Any]:
     roots = sorted({folder for path in paths for folder in path.absolute().parents})
     grid = read_grid(roots)
     shape = grid.shape_drea
-    fields = fit_radar((read_tesseract(p, shape_drea=shape) for p in paths), grid)
+    tensors = (read_tesseract(path, shape_drea=shape) for path in paths)
+    first = next(tensors)
+    fields = fit_radar(itertools.chain([first], tensors), grid)
     is_kradar = grid == RadarGrid.kradar()
     section = {"grid": "kradar" if is_kradar else grid.to_dict(), "radar": fields}
     maps = {
-        f"recording, {paths[0].name}": _mean_db(read_tesseract(paths[0])),
+        f"recording, {paths[0].name}": _mean_db(first),
         "simulation": _mean_db(_simulated(section)),
     }
     out = files.as_path(out)
