@@ -203,10 +203,20 @@ def read_polar(path: PathLike, grid: RadarGrid) -> Polar:
             f"{path}: a projection, which has no mean power of cells; expected a radar "
             "tensor, polar3d or rpc file"
         )
+    return reduce_tensor(read_power(path, grid), grid)
+
+
+def read_power(path: PathLike, grid: RadarGrid) -> Real[np.ndarray, "D R E A"]:
+    """Read the radar tensor of a sensor and check that its values can be linear power.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        DataError: The file is corrupted, or of another shape, or its values are not power.
+    """
     tensor = read_tesseract(path, shape_drea=grid.shape_drea)
-    elevations = project_tensor(tensor)[..., grid.num_doppler :]
+    elevations = project_tensor(tensor)[..., tensor.shape[0] :]
     _check_power(path, elevations, float(tensor[..., 0].min()))
-    return reduce_tensor(tensor, grid)
+    return tensor
 
 
 def check_frame(path: PathLike, grid: RadarGrid, *, deep: bool = False) -> None:

@@ -14,7 +14,7 @@ from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.core.files import PathLike
 from radejax.data.kradar.dataset import read_grid
-from radejax.data.tesseract import read_tesseract
+from radejax.data.tesseract import read_power
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.config import SimulationConfig
 from radejax.simulation.radar.fit import fit_radar
@@ -39,7 +39,8 @@ def fit_files(recordings: Sequence[PathLike], out: PathLike) -> dict[str, Any]:
 
     Raises:
         UserError: There is no radar tensor.
-        DataError: A tensor cannot be read, has other axes or no noise to measure.
+        DataError: A tensor cannot be read, has other axes, is not linear power or has no
+            noise to measure.
     """
     paths: list[pathlib.Path] = []
     for path in map(files.as_path, recordings):
@@ -50,8 +51,7 @@ def fit_files(recordings: Sequence[PathLike], out: PathLike) -> dict[str, Any]:
         raise UserError(f"no radar tensors in {names}: looked for tesseract_*.mat")
     roots = sorted({folder for path in paths for folder in path.absolute().parents})
     grid = read_grid(roots)
-    shape = grid.shape_drea
-    tensors = (read_tesseract(path, shape_drea=shape) for path in paths)
+    tensors = (read_power(path, grid) for path in paths)
     first = next(tensors)
     fields = fit_radar(itertools.chain([first], tensors), grid)
     is_kradar = grid == RadarGrid.kradar()
