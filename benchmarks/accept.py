@@ -35,7 +35,8 @@ import radejax
 from radejax.data.cameras import no_images
 from radejax.inference.export import export
 from radejax.inference.exported_loader import load
-from radejax.simulation.config import FULL_SIZE, default_config
+from radejax.models.vit import ViT
+from radejax.simulation.config import FULL_SIZE, SimulationOptions
 from radejax.weights import dinov3_hf
 
 CORES = len(os.sched_getaffinity(0))
@@ -88,14 +89,15 @@ def steps(model, folder, is_short):
         data = folder / "data"
     else:
         config, size, count, dtype = model, 8, 90, "bfloat16"
-        scenes = default_config() | FULL_SIZE | {"output": "projection"}
-        scenes |= {"train_sequences": 8, "test_sequences": 0, "frames_per_sequence": 4}
+        counts = {"train_sequences": 8, "test_sequences": 0, "frames_per_sequence": 4}
+        scenes = SimulationOptions(**FULL_SIZE, output="projection", **counts)
         data = radejax.simulate(scenes, folder.parent / "data", num_workers=CORES)
     words = ["--data", data, f"--config.model.dtype={dtype}"]
     if model == "dinorade":  # random weights, as DINOv3's have to be downloaded
         detector = stages.untrained(radejax.load_config(config))
         weights = detector.variables["params"]["image_backbone"]
-        dinov3_hf.save(detector.model.vit, weights, folder / "backbone")
+        vit = ViT(detector.model.options.image)
+        dinov3_hf.save(vit, weights, folder / "backbone")
         words += ["--image-backbone", folder / "backbone"]
     fields = {"batch_size": size, "num_epochs": count, "max_steps": count}
     fields |= {"warmup_steps": 0, "log_every_steps": count // 3}
@@ -126,7 +128,8 @@ def boxes(folder, is_short):
         rng = np.random.default_rng(0)
         shape = (4, 1, *found.grid.shape_drea)
         tensors = rng.standard_exponential(shape, np.float32) * np.float32(1e9)
-        camera = no_images(1, found.model.image_size) if found.takes_camera else ()
+        model = found.model.options
+        camera = no_images(1, model.image.size) if found.takes_camera else ()
         items = [(tensor, *camera) if camera else tensor for tensor in tensors]
         call = waiting(found, tensors[0], *camera)
         first, *later = [call()[0] for _ in range(6)]
@@ -138,11 +141,15 @@ def boxes(folder, is_short):
 
 def exports(folder, is_short):
     """Boxes of the bundled model on simulated frames, and their differences from the first row."""
-    scenes = {"seed": 1000, "train_sequences": 0, "test_sequences": 8}
-    scenes |= {"frames_per_sequence": 1, "image_width": 0, "image_height": 0}
-    frames = radejax.KRadar(
-        [radejax.simulate(default_config() | scenes, folder / "data")]
+    scenes = SimulationOptions(
+        seed=1000,
+        train_sequences=0,
+        test_sequences=8,
+        frames_per_sequence=1,
+        image_width=0,
+        image_height=0,
     )
+    frames = radejax.KRadar([radejax.simulate(scenes, folder / "data")])
     x = np.stack([frame.read_projection(frames.grid) for frame in frames])
     make = functools.partial(
         radejax.Detector, radejax.load_model(DEMO), batch_sizes=(8,)

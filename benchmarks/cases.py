@@ -21,14 +21,14 @@ import stages
 import start
 from case import Case, compiled, difference, first_call, timed, waiting
 
-from radejax.core.config import load_config
+from radejax.config import load_config
 from radejax.data.kradar.write import write_tesseract
 from radejax.data.pipeline import LoaderOptions, make_loader, make_table
 from radejax.data.projection import project_jax, project_tensor
 from radejax.data.tesseract import project_file
 from radejax.evaluation import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOLS
-from radejax.evaluation.results import EvaluationOptions, compute_results
+from radejax.evaluation.results import ReportOptions, compute_results
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.export import export
 from radejax.inference.exported_loader import load as load_exported
@@ -99,7 +99,7 @@ def evaluate(machine):
     """Evaluation of a test split of K-Radar's size in every protocol and weather."""
     for false_per_frame in (2, 50):
         truth, found, frames = inputs.synthetic_set(false_per_frame=false_per_frame)
-        options = EvaluationOptions(protocols=tuple(PROTOCOLS))
+        options = ReportOptions(protocols=tuple(PROTOCOLS))
 
         def everything(truth=truth, found=found, frames=frames, options=options):
             data = EvaluationSet(truth, found, frames=frames)

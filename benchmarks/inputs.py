@@ -26,7 +26,7 @@ from radejax.detection.decode import decode
 from radejax.geometry.boxes import bev_corners
 from radejax.geometry.camera import CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.simulation.config import FULL_SIZE, SimulationConfig, default_config
+from radejax.simulation.config import FULL_SIZE, SimulationOptions
 from radejax.simulation.radar import tensor
 from radejax.simulation.simulator import SequenceSimulator
 from radejax.simulation.world.traffic import make_sequence
@@ -80,12 +80,12 @@ def frames_of(size, **camera):
 
 def simulator_of(weather="rain"):
     """Returns the arrays of one frame of the simulated radar, and the simulating function."""
-    config = SimulationConfig.from_mapping(default_config() | FULL_SIZE)
+    options = SimulationOptions(**FULL_SIZE)
     sequence = make_sequence(
         1, environment="urban", time="day", weather=weather, num_frames=1,
         rng=np.random.default_rng(len(weather)),
     )  # fmt: skip
-    grid, parameters = config.make_grid(), config.make_parameters()
+    grid, parameters = options.make_grid(), options.make_parameters()
     simulator = SequenceSimulator(sequence, grid, parameters, seed=0)
     arrays = simulator.radar_input(sequence.frame(0)).arrays
     return arrays, functools.partial(tensor.simulate, grid=grid, parameters=parameters)

@@ -25,7 +25,7 @@ import jax
 import numpy as np
 
 from radejax.cli import entry
-from radejax.core.config import load_module
+from radejax.config import load_module
 from radejax.inference.saved import load_model
 from radejax.runs import experiment
 
@@ -42,22 +42,24 @@ def make_config(steps):
     """Returns a quickstart config that is so small that starting takes longer than training."""
     path = REPOSITORY / "configs" / "quickstart.py"
     module = load_module(path)
-    config = module.get_config("short")
-    config.simulation.update(train_sequences=2, frames_per_sequence=5)
-    config.model.update(
-        widths=(8, 8, 8),
-        decoder_width=8,
-        num_groups=4,
-        cbam="off",
-        neck="plain",
-        heads="default",
+    return module.get_config("short").replace(
+        simulation={"train_sequences": 2, "frames_per_sequence": 5},
+        model={
+            "widths": (8, 8, 8),
+            "decoder_width": 8,
+            "num_groups": 4,
+            "cbam": "off",
+            "neck": "plain",
+            "heads": "default",
+        },
+        # Ten frames are two steps per epoch, as incomplete batches are dropped.
+        train={
+            "num_epochs": steps // 2,
+            "checkpoint_every_steps": 7,
+            "log_every_steps": 5,
+        },
+        evaluation={"num_visualizations": 0, "protocols": ("all_point",)},
     )
-    # Ten frames are two steps per epoch, as incomplete batches are dropped.
-    config.train.update(
-        num_epochs=steps // 2, checkpoint_every_steps=7, log_every_steps=5
-    )
-    config.evaluation.update(num_visualizations=0, protocols=("all_point",))
-    return config
 
 
 def run(folder, name, steps):
@@ -65,8 +67,7 @@ def run(folder, name, steps):
     sys.stdout = sys.stderr = (folder / f"{name}.log").open("a")
     jax.config.update("jax_platforms", "cpu")
     entry.set_up_jax()
-    config = make_config(steps)
-    config.data.roots = (str(folder / "data"),)
+    config = make_config(steps).replace(data={"roots": (str(folder / "data"),)})
     experiment.run(config, folder / name)
 
 

@@ -17,7 +17,7 @@ from case import Case, compiled, difference, first_call, timed, waiting
 from rival import ATTENTION
 
 from radejax import models
-from radejax.core.config import load_config
+from radejax.config import load_config
 from radejax.data.pipeline import LoaderOptions, make_loader, make_table
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.deformable_attention import DeformableAttention
@@ -69,10 +69,8 @@ def random_variables(model, *arguments):
 
 def network(path, dtype, **fields):
     """Returns config, model and the precision of its matrix products; None is the default."""
-    config = load_config(str(CONFIGS / path))
-    config.model.update(
-        dtype="bfloat16" if dtype == "bfloat16" else "float32", **fields
-    )
+    fields["dtype"] = "bfloat16" if dtype == "bfloat16" else "float32"
+    config = load_config(str(CONFIGS / path)).replace(model=fields)
     precision = "highest" if dtype == "float32" else None
     return config, models.build(config.model), precision
 
@@ -83,12 +81,13 @@ def torch_state(model, variables):
     rules = (
         *radenet_torch.neck_rules("image_fusion/radar_neck", "radar_neck.neck"),
         *radenet_torch.neck_rules("image_fusion/camera_neck", "camera_neck.neck"),
-        *radenet_torch.rules(model.heads),
+        *radenet_torch.rules(model.options.heads),
         (r"^image_backbone/layers/", "image_backbone.layers.{}."),
         (r"^image_fusion/", ""),
         (r"/", "."),
     )
-    backbone, size = params["image_backbone"], model.vit.patch_size
+    backbone, vit = params["image_backbone"], model.options.image
+    size = vit.patch_size
     patches = dict(backbone["patch_embed"])
     patches["kernel"] = patches["kernel"].reshape(size, size, 3, -1)
     params["image_backbone"] = {**backbone, "patch_embed": patches}
@@ -96,7 +95,6 @@ def torch_state(model, variables):
     for name in [n for n in state if n.endswith(".running_var")]:
         state[name.replace("running_var", "num_batches_tracked")] = np.array(0)
     rows, columns, channels = model.feature_shape
-    vit = model.vit
     angles = rotary_angles(rows, columns, channels // vit.num_heads)
     names = ("image_backbone.cos", "image_backbone.sin")
     return state | dict(zip(names, map(np.asarray, angles), strict=True))
@@ -133,7 +131,7 @@ def step_of(config, model, variables, batch, precision):
         is_frozen=getattr(model, "is_frozen", None),
     )
     map_grid = models.map_grid(GRID, model, "true")
-    step = make_train_step(model, optimizer, map_grid, loss=dict(config.loss))
+    step = make_train_step(model, optimizer, map_grid, loss=config.loss)
     given, rng = jax.device_put(batch), jax.random.key(0)
     program, cost = compiled(
         step, state, given, rng, precision=precision, donate_argnums=0
@@ -172,7 +170,7 @@ def radenet(machine):
         state = radenet_torch.save(model, variables)
         how = dtype, None, (dtype, size) in COMPILED
         columns = {"radejax": waiting(forward, *on_device)}
-        columns |= rivals(machine, "radenet", dict(config.model), state, x, *how)
+        columns |= rivals(machine, "radenet", config.model.to_dict(), state, x, *how)
         yield Case(
             name=name,
             columns=columns,
@@ -201,7 +199,7 @@ def radenet_training(machine):
         if machine["rival"] and remat == "none":
             state = radenet_torch.save(model, variables)
             how = dtype, torch_losses(config, model, batch), False
-            given = dict(config.model), state, batch.projection
+            given = config.model.to_dict(), state, batch.projection
             columns |= rivals(machine, "radenet", *given, *how)
             ours = [np.asarray(step()["weighted_sum"])]
             error = difference(ours, machine["rival"].outputs())
@@ -265,7 +263,7 @@ def dinorade(machine, task="forward"):
         config, model, precision = network("dinorade.py", dtype)
         places, camera = camera_of(model, size)
         rng = np.random.default_rng(0)
-        image = rng.integers(0, 256, (size, *model.image_size, 3), np.uint8)
+        image = rng.integers(0, 256, (size, *model.options.image.size, 3), np.uint8)
         batch = inputs.frames_of(size, image=image, camera=camera)
         arguments = batch.projection, image, camera
         variables = random_variables(model, *arguments)
@@ -308,13 +306,19 @@ def camera_of(model, size):
 
     All queries count as in view, as in the PyTorch network.
     """
-    places = reference_points(
-        inputs.CALIBRATION.camera(), model.query_grid, 256, 112
-    ).points
-    places = np.asarray(places, np.float32)
+    places = reference_points_of(model)
     every = np.broadcast_to(places, (size, *places.shape[1:]))
     camera = ReferencePoints(every, np.ones(every.shape[:-1], bool))
     return places.reshape(256 * 112, -1, 2), camera
+
+
+def reference_points_of(model):
+    """Returns the reference points `[R, A, E, 2]` of K-Radar's sensors on the padded bins."""
+    options, camera = model.options, inputs.CALIBRATION.camera()
+    places = reference_points(
+        camera, options.query_grid, 256, 112, options.fusion.num_elevation
+    )
+    return np.asarray(places.points, np.float32)
 
 
 def attention(machine):
@@ -336,14 +340,12 @@ def attention(machine):
     state = {f"{k}.weight": v["kernel"].T for k, v in params.items()}
     state |= {f"{k}.bias": v["bias"] for k, v in params.items()}
     _, model, _ = network("dinorade.py", "float32")
-    places = reference_points(
-        inputs.CALIBRATION.camera(), model.query_grid, 256, 112
-    ).points
+    places = reference_points_of(model).reshape(1, bins, elevation, 2)
     scale = np.exp(normal((1, bins, elevation)))
     given = (
         normal((1, bins, width)),
         scale / scale.sum(-1, keepdims=True),
-        np.asarray(places, np.float32).reshape(1, bins, elevation, 2),
+        places,
         normal((1, 180, 320, width)),
     )
 
@@ -384,7 +386,7 @@ def detector(machine):
             x = inputs.frames_of(size).projection
             how = dtype, None, False
             (theirs,) = rivals(
-                machine, "radenet", dict(config.model), state, x, *how
+                machine, "radenet", config.model.to_dict(), state, x, *how
             ).values()
             columns["released chain"] = functools.partial(
                 released_chain, frames, theirs, inputs.peaks_on_host(40)

@@ -32,7 +32,7 @@ import jax.export
 import jax.numpy as jnp
 
 from radejax import models
-from radejax.core.config import load_config
+from radejax.config import load_config
 from radejax.core.structures import Batch
 from radejax.data.cameras import no_images
 from radejax.geometry.radar_grid import RadarGrid
@@ -69,7 +69,8 @@ def batch_of(model, grid, size, max_objects=16):
     rows = size, max_objects
     image = camera = None
     if models.has_camera(model):
-        image, camera = jax.eval_shape(lambda: no_images(size, model.image_size))
+        pixels = model.options.image.size
+        image, camera = jax.eval_shape(lambda: no_images(size, pixels))
     return Batch(
         projection=shape_of(size, *grid.projection_shape, dtype=jnp.float16),
         boxes=shape_of(*rows, 8),
@@ -104,7 +105,7 @@ def train_step(config, grid, size):
         is_frozen=getattr(model, "is_frozen", None),
     )
     map_grid = models.map_grid(grid, model, "true")
-    step = make_train_step(model, optimizer, map_grid, loss=dict(config.loss))
+    step = make_train_step(model, optimizer, map_grid, loss=config.loss)
     rng = jax.eval_shape(lambda: jax.random.key(0))
     state = jax.eval_shape(create, variables)
     return step, (state, batch_of(model, grid, size), rng)
@@ -273,8 +274,7 @@ def full_size(size, dtype="bfloat16"):
     grid = RadarGrid.kradar()
     programs = {"simulator": (*simulator(grid), 1)}
     for name, path in (("RADE-Net", "radenet.py"), ("DinoRADE", "dinorade.py")):
-        config = load_config(str(CONFIGS / path))
-        config.model.dtype = dtype
+        config = load_config(str(CONFIGS / path)).replace(model={"dtype": dtype})
         programs[f"{name}, detector"] = (*detector(config, grid, size), size)
         programs[f"{name}, training step"] = (*train_step(config, grid, size), size)
     return programs

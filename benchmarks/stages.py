@@ -14,39 +14,36 @@ from typing import Any
 import flax.linen as nn
 import jax
 import numpy as np
-from ml_collections import ConfigDict
 from module_calls import ModuleCall, module_calls
 from tabulate import tabulate
 
 from radejax import models
 from radejax.cli.entry import set_up_jax
-from radejax.core.config import load_config
+from radejax.config import Config, load_config
 from radejax.data.cameras import no_images
 from radejax.data.projection import project_jax
 from radejax.detection.decode import decode
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.detector import Detector
 from radejax.inference.saved import SavedModel
-from radejax.simulation.config import SimulationConfig
 
 STAGES = ("transfer", "projection", "network", "decode + NMS")
 
 
-def untrained(config: ConfigDict, **overrides: Any) -> Detector:
+def untrained(config: Config, **overrides: Any) -> Detector:
     """Returns a detector with random weights for a config.
 
     Args:
-        config: A complete config. Its `simulation` section gives the grid; without one, the grid
-            is K-Radar's.
+        config: A config. Its section `simulation` gives the grid; without one, the grid is
+            K-Radar's.
         **overrides: Arguments of `Detector`.
     """
-    grid = RadarGrid.kradar()
-    if "simulation" in config:
-        grid = SimulationConfig.from_mapping(config["simulation"]).make_grid()
-    model = models.build(config["model"])
+    simulation = config.simulation
+    grid = RadarGrid.kradar() if simulation is None else simulation.make_grid()
+    model = models.build(config.model)
     inputs: tuple[Any, ...] = (np.zeros((1, *grid.projection_shape), np.float32),)
     if models.has_camera(model):
-        inputs += no_images(1, model.image_size)
+        inputs += no_images(1, model.options.image.size)
     # Only shapes are computed, as compiling the initialization takes longer than measuring.
     shapes = jax.eval_shape(model.init, jax.random.key(0), *inputs)
     rng = np.random.default_rng(0)
@@ -100,7 +97,7 @@ def _measure(
     frames *= 1e9 if tesseract else 0.3
     extra: tuple[Any, ...] = ()
     if detector.takes_camera:
-        image, camera = no_images(batch, detector.model.image_size)
+        image, camera = no_images(batch, detector.model.options.image.size)
         extra = image, camera.replace(is_valid=np.ones(batch, bool))
     sized = detector.replace(batch_sizes=(batch,))  # no padding to another size
 

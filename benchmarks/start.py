@@ -22,7 +22,7 @@ _DETECT = f"""
 import sys
 sys.path.append({str(_ROOT / "benchmarks")!r})
 import numpy as np
-from radejax.core.config import load_config
+from radejax.config import load_config
 from stages import untrained
 found = untrained(load_config("radenet"), batch_sizes=(1,), score_threshold=0.0)
 x = np.zeros((1, *found.grid.projection_shape), np.float32)

@@ -165,7 +165,7 @@ class Backbone(nn.Module):
         for i, width in enumerate((*widths[-2::-1], c["decoder_width"]), 1):
             skip = widths[-i]
             self.add_module(f"upsample_{i}", Upsample(x))
-            if c["cbam"] is not None:
+            if c["cbam"] != "off":
                 self.add_module(f"cbam_{i}", CBAM(skip, groups, c["cbam"]))
             self.add_module(f"decoder_block_{i}", DoubleConv(x + skip, width, groups))
             x = width
@@ -261,7 +261,7 @@ class Heads(nn.Module):
 class RadeNet(nn.Module):
     """Detector from `[B, D+E, R, A]`, padded, to logits `[B, C, R, A]` and boxes `[B, 8, R, A]`.
 
-    `config` has the fields of `config.model`, where `cbam` must be None instead of "off".
+    `config` has the fields of `config.model`.
     """
 
     def __init__(self, config):

@@ -35,14 +35,13 @@ The weights of the image backbone are not part of a config; `train.py --image-ba
 
 import pathlib
 import types
+from typing import Any
 
-from ml_collections import ConfigDict
-from ml_collections.config_dict import placeholder
-
-from radejax.core.config import base_config, load_module, parse_options
+from radejax.config import Config, load_module, parse_options
+from radejax.data.cameras import CameraOptions
 from radejax.geometry.camera import KRADAR_RADAR_FROM_LIDAR_Z_M
-from radejax.geometry.radar_grid import RadarGrid
-from radejax.models.lifting import OFFICIAL_OFFSET_M, LiftingAxes
+from radejax.models.lifting import OFFICIAL_OFFSET_M
+from radejax.models.options import DinoRadeOptions, QueryGridOptions, RadeNetOptions
 
 
 def _radenet() -> types.ModuleType:
@@ -50,7 +49,7 @@ def _radenet() -> types.ModuleType:
     return load_module(pathlib.Path(__file__).with_name("radenet.py"))
 
 
-VARIANTS = {
+VARIANTS: dict[str, dict[str, Any]] = {
     "r": {},
     "rc": {"model.fusion.weighting": "off"},
     "rcw": {},
@@ -93,134 +92,43 @@ PRESETS = {
 CLASS_SETS = ("all", "sedan")
 
 
-def get_config(arg: str | None = None) -> ConfigDict:
+def get_config(arg: str | None = None) -> Config:
     """Return the complete config; see the module docstring for `arg`."""
-    sigmas, releases = _radenet().SIGMAS, _radenet().RELEASES
+    radenet = _radenet()
     variant, preset, sigma, classes, release = parse_options(
-        arg, VARIANTS, PRESETS, sigmas, CLASS_SETS, releases
+        arg, VARIANTS, PRESETS, radenet.SIGMAS, CLASS_SETS, radenet.RELEASES
     )
     variant = variant or "rcw"
-    config = base_config()
-    config.model.input_stem = True
-    config.loss.heatmap_sigma_bins = 0.75
-    config.train.update(batch_size=6, num_epochs=11)
-    config.data.camera = _camera()
-    _add_camera_model(config.model)
+    config = Config(model=DinoRadeOptions(input_stem=True)).replace(
+        loss={"heatmap_sigma_bins": 0.75},
+        train={"batch_size": 6, "num_epochs": 11},
+        data={"camera": CameraOptions()},
+    )
     if preset is not None:
-        for rows in (_radenet().PRESETS[preset], PRESETS[preset]):
-            config.update_from_flattened_dict(rows)
+        config = config.with_fields(radenet.PRESETS[preset] | PRESETS[preset])
     if preset == "official":
-        config.model.query_grid = _axes(LiftingAxes.official())
         # The released code only scales the images of its ResNet to [0, 1].
-        config.model.image.standardize = variant != "rcw_resnet50"
-    config.update_from_flattened_dict(VARIANTS[variant])
+        is_standardized = variant != "rcw_resnet50"
+        config = config.replace(
+            model={
+                "query_grid": QueryGridOptions.official(),
+                "image": {"standardize": is_standardized},
+            }
+        )
+    config = config.with_fields(VARIANTS[variant])
     if sigma is not None:
-        config.loss.update(sigmas[sigma])
+        config = config.replace(loss=radenet.SIGMAS[sigma])
     if release is not None:
-        config.update_from_flattened_dict(releases[release])
+        config = config.with_fields(radenet.RELEASES[release])
     if variant == "r":
-        config.model.name = "radenet"
-        for section in ("image", "fusion", "query_grid"):
-            del config.model[section]
-        del config.data.camera
+        config = config.replace(model=radar_part(config.model), data={"camera": None})
     if classes == "sedan":
-        config.classes = ("Sedan",)
-        config.model.num_classes = 1
-        config.data.label_version = "v1.1"
+        config = config.with_fields(radenet.SEDAN)
     return config
 
 
-def _add_camera_model(model: ConfigDict) -> None:
-    model.name = "dinorade"
-    model.image = ConfigDict(
-        {
-            # vit or resnet50.
-            "kind": "vit",
-            # Height and width of the images in pixels; the transformer resizes them to the
-            # nearest multiples of its patch size.
-            "size": (720, 1280),
-            # Keep the image backbone fixed.
-            "freeze": True,
-            # Normalize by ImageNet's statistics; otherwise scale to [0, 1].
-            "standardize": True,
-            # Channels of the transformer (the defaults are DINOv3 ViT-S/16).
-            "hidden_size": 384,
-            # Layers of the transformer.
-            "num_layers": 12,
-            # Attention heads of the transformer.
-            "num_heads": 6,
-            # Hidden channels of its MLPs.
-            "mlp_dim": 1536,
-            # Pixels per patch and axis.
-            "patch_size": 16,
-            # Register tokens.
-            "num_registers": 4,
-            # Gated MLPs with SiLU instead of GELU.
-            "gated_mlp": False,
-            # Initial value of the layer scale; DINOv3's come with the weights.
-            "layer_scale": 1.0,
-            # Patches per axis of DINOv2's position embedding; 0: DINOv3's rotary embedding.
-            "position_grid": 0,
-            # Implementation of the attention: auto, or one of `radejax.models.vit`.
-            "attention": "auto",
-            # Channels of the ResNet's stem; 64 in ResNet-50.
-            "resnet_width": 64,
-        }
-    )
-    model.fusion = ConfigDict(
-        {
-            # Heads of the deformable attention; must divide `decoder_width`.
-            "num_heads": 4,
-            # Sampling points per head and query.
-            "num_points": 4,
-            # Queries per bin, at different elevations.
-            "num_elevation": 10,
-            # Elevation weights: mlp (paper), cnn (released), off.
-            "weighting": "mlp",
-            # Gate: channel (paper) or bin (released).
-            "gate": "channel",
-            # Queries outside the image: drop, or official (zeroed, but counted).
-            "out_of_view": "drop",
-            # A dilated neck on each map before the attention.
-            "necks": True,
-            # Dropout rate on the fused map, from 0 to below 1.
-            "dropout": 0.1,
-            # Bins that are attended at a time; 0: chosen by platform.
-            "chunk_size": 0,
-        }
-    )
-    model.query_grid = _axes(LiftingAxes.of_grid(RadarGrid.kradar()))
-
-
-def _axes(axes: LiftingAxes) -> ConfigDict:
-    """Axes of the radar queries."""
-    return ConfigDict(
-        {
-            # Center of the first query in range and the step, in meters; or the centers of
-            # all bins if they are not uniform.
-            "range_m": axes.range_m,
-            # The same in azimuth, in degrees.
-            "azimuth_deg": axes.azimuth_deg,
-            # Elevation span in degrees, which `fusion.num_elevation` segments divide.
-            "elevation_deg": axes.elevation_deg,
-        }
-    )
-
-
-def _camera() -> ConfigDict:
-    return ConfigDict(
-        {
-            # raw (with lens distortion) or pinhole (without, as released).
-            "projection": "raw",
-            # Shift from LiDAR to radar in meters; None: each sequence's own.
-            "radar_from_lidar_m": placeholder(tuple),
-            # Its z, which does not move boxes; None: K-Radar's 0.7, or the simulation's.
-            "radar_from_lidar_z_m": placeholder(float),
-            # sequence (each sequence's own) or common (cam_front0.yml, as released).
-            "calibration": "sequence",
-            # Resize images of another size than `model.image.size`; otherwise an error.
-            "resize": False,
-            # Predict frames without an image from the radar only; otherwise an error.
-            "allow_missing": True,
-        }
-    )
+def radar_part(model: RadeNetOptions) -> RadeNetOptions:
+    """Return the options of the radar branch of a model alone."""
+    names = RadeNetOptions.model_fields
+    fields = {name: value for name, value in model if name in names}
+    return RadeNetOptions(**fields | {"name": "radenet"})

@@ -11,27 +11,23 @@ Option `short`: a run of two minutes that tests the installation and hardly lear
 
 import pathlib
 
-from ml_collections import ConfigDict
-
-from radejax.core.config import load_module, parse_options, plain
+from radejax.config import Config, load_module, parse_options
 from radejax.simulation.config import FULL_SIZE
 
 
-def get_config(arg: str | None = None) -> ConfigDict:
+def get_config(arg: str | None = None) -> Config:
     """Return the complete config; `arg` is None or "short"."""
     (length,) = parse_options(arg, ("short",))
     quickstart = load_module(pathlib.Path(__file__).with_name("quickstart.py"))
     config = quickstart.get_config(",".join(filter(None, ("ablation", length))))
-    config.simulation = ConfigDict(plain(config.simulation) | FULL_SIZE)
-    config.simulation.output = "projection"  # a 4D tensor has 260 MB
-    config.model.update(doppler_bins=64, elevation_bins=37)
-    # The same width in meters as in `quickstart:ablation`: bins are 2.6 times finer.
-    config.loss.heatmap_sigma_bins = 2.6
+    frames = {"train_sequences": 800}
     if length == "short":
-        config.simulation.update(
-            train_sequences=2, test_sequences=1, frames_per_sequence=4
-        )
-    else:
-        config.simulation.update(train_sequences=800)
-        config.train.num_epochs = 5
-    return config
+        frames = {"train_sequences": 2, "test_sequences": 1, "frames_per_sequence": 4}
+    return config.replace(
+        # A 4D tensor has 260 MB.
+        simulation=FULL_SIZE | frames | {"output": "projection"},
+        model={"doppler_bins": 64, "elevation_bins": 37},
+        # The same width in meters as in `quickstart:ablation`: bins are 2.6 times finer.
+        loss={"heatmap_sigma_bins": 2.6},
+        train={} if length == "short" else {"num_epochs": 5},
+    )

@@ -12,71 +12,81 @@ Options:
 - `short`: a run of two minutes that tests the installation and hardly learns anything.
 """
 
-from ml_collections import ConfigDict
+from radejax.config import Config, parse_options
+from radejax.losses.detection import LossOptions
+from radejax.models.options import RadeNetOptions
+from radejax.simulation.config import SimulationOptions
 
-from radejax.core.config import base_config, parse_options
-from radejax.simulation.config import default_config
 
-
-def get_config(arg: str | None = None) -> ConfigDict:
+def get_config(arg: str | None = None) -> Config:
     """Return the complete config; see the module docstring for `arg`."""
     recipe, length = parse_options(arg, ("ablation",), ("short",))
-    config = base_config()
-    config.simulation = ConfigDict(default_config())
-    grid = config.simulation.grid
     # One frame per sequence, as another scene is more informative than the next tenth
     # of a second. Rare classes are oversampled.
-    config.simulation.update(
+    simulation = SimulationOptions(
         train_sequences=640,
         test_sequences=224,
         frames_per_sequence=1,
         vru_density_scale=3.0,
     )
-    config.data.mirror_probability = 0.5
-    config.model.update(
-        doppler_bins=grid.num_doppler,
-        elevation_bins=grid.num_elevation,
-        widths=(32, 64, 128),
-        decoder_width=32,
-        num_groups=8,
-        heatmap_prior=0.02,  # about the value that the first epochs would learn
+    grid = simulation.make_grid()
+    config = Config(
+        simulation=simulation,
+        model=RadeNetOptions(
+            doppler_bins=grid.num_doppler,
+            elevation_bins=grid.num_elevation,
+            widths=(32, 64, 128),
+            decoder_width=32,
+            num_groups=8,
+            heatmap_prior=0.02,  # about the value that the first epochs would learn
+        ),
+        loss=LossOptions(heatmap_sigma_bins=1.0),  # a bin is 1.2 m long
+    ).replace(
+        data={"mirror_probability": 0.5},
+        train={
+            "batch_size": 2,
+            "num_epochs": 7,
+            "warmup_steps": 20,
+            "log_every_steps": 20,
+            "checkpoint_every_steps": 200,
+        },
+        evaluation={
+            "score_threshold": 0.05,
+            "protocols": ("kradar_r40", "all_point", "coco101"),
+        },
     )
-    config.loss.heatmap_sigma_bins = 1.0  # a bin is 1.2 m long
-    config.train.update(
-        batch_size=2,
-        num_epochs=7,
-        warmup_steps=20,
-        log_every_steps=20,
-        checkpoint_every_steps=200,
-    )
-    config.evaluation.score_threshold = 0.05
-    config.evaluation.protocols = ("kradar_r40", "all_point", "coco101")
     if recipe != "ablation":
-        _apply_recipe(config)
+        config = _with_recipe(config)
     if length == "short":
-        config.simulation.update(
-            train_sequences=2, test_sequences=1, frames_per_sequence=12
+        config = config.replace(
+            simulation={
+                "train_sequences": 2,
+                "test_sequences": 1,
+                "frames_per_sequence": 12,
+            },
+            train={
+                "batch_size": 4,
+                "num_epochs": 2,
+                "warmup_steps": 0,
+                "ema_decay": None,  # an average over so few steps would be the initial values
+                "log_every_steps": 10,
+                "checkpoint_every_steps": 2,
+            },
+            evaluation={"num_visualizations": 2},
         )
-        config.train.update(
-            batch_size=4,
-            num_epochs=2,
-            warmup_steps=0,
-            ema_decay=None,  # an average over so few steps would be the initial parameters
-            log_every_steps=10,
-            checkpoint_every_steps=2,
-        )
-        config.evaluation.num_visualizations = 2
     return config
 
 
-def _apply_recipe(config: ConfigDict) -> None:
-    """Apply the settings of `docs/reports/2026-11-24_quickstart_tuning.md`."""
-    config.simulation.update(train_sequences=1600, vru_density_scale=5.0)
-    # The input has mean 0.64 and standard deviation 0.044: without scaling, it is almost
-    # constant.
-    config.model.update(input_center=0.64, input_scale=14.0)
-    config.loss.heatmap_sigma_bins = 0.75
-    # Classification is harder than box regression. Smooth L1 is dominated by boxes with
-    # large errors, mostly trucks; the GWD also improves boxes that are nearly right.
-    config.loss.weights.update(focal=8.0, gwd=4.0)
-    config.train.update(num_epochs=7, ema_decay=0.999)
+def _with_recipe(config: Config) -> Config:
+    """Return a config with the settings of `docs/reports/2026-11-24_quickstart_tuning.md`."""
+    return config.replace(
+        simulation={"train_sequences": 1600, "vru_density_scale": 5.0},
+        # The input has mean 0.64 and standard deviation 0.044: without scaling, it is
+        # almost constant.
+        model={"input_center": 0.64, "input_scale": 14.0},
+        # Classification is harder than box regression. Smooth L1 is dominated by boxes
+        # with large errors, mostly trucks; the GWD also improves boxes that are nearly
+        # right.
+        loss={"heatmap_sigma_bins": 0.75, "weights": {"focal": 8.0, "gwd": 4.0}},
+        train={"num_epochs": 7, "ema_decay": 0.999},
+    )

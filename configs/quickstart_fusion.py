@@ -23,73 +23,70 @@ Options:
 """
 
 import pathlib
-import types
+from typing import Any
 
-from ml_collections import ConfigDict
+from radejax.config import Config, load_module, parse_options
+from radejax.data.cameras import CameraOptions
+from radejax.models.options import (
+    DinoRadeOptions,
+    FusionOptions,
+    ImageOptions,
+    QueryGridOptions,
+)
+from radejax.simulation.config import SimulationOptions
 
-from radejax.core.config import load_module, parse_options
-from radejax.models.lifting import LiftingAxes
-from radejax.simulation.config import SimulationConfig
 
-
-def _load_neighbor(name: str) -> types.ModuleType:
-    """Load another config of this folder."""
-    return load_module(pathlib.Path(__file__).with_name(f"{name}.py"))
-
-
-def get_config(arg: str | None = None) -> ConfigDict:
+def get_config(arg: str | None = None) -> Config:
     """Return the complete config; see the module docstring for `arg`."""
     sensors, content, length, backbone = parse_options(
         arg, ("radar",), ("silhouettes",), ("short", "long"), ("pretrained", "resnet50")
     )
     options = {None: "ablation", "short": "ablation,short", "long": ""}[length]
-    config = _load_neighbor("quickstart").get_config(options)
-    config.simulation.update(
-        output="projection",
-        image_width=640,  # reduced in height, as objects stand side by side
-        image_height=80,
+    quickstart = load_module(pathlib.Path(__file__).with_name("quickstart.py"))
+    config = quickstart.get_config(options).replace(
+        simulation={
+            "output": "projection",
+            "image_width": 640,  # reduced in height, as objects stand side by side
+            "image_height": 80,
+            "camera_mode": "oracle" if content == "silhouettes" else "scene",
+        },
+        model={"input_stem": True},
     )
-    if content == "silhouettes":
-        config.simulation.camera_mode = "oracle"
-    config.model.input_stem = True
     if sensors != "radar":
-        _add_camera(config)
-        config.model.image.freeze = backbone is not None
+        config = _with_camera(config, config.simulation)
+        # Without a backbone, it is trained from scratch, without downloads.
+        image: dict[str, Any] = {"freeze": backbone is not None}
         if backbone == "resnet50":
             # Half a million parameters, as many as the transformer.
-            config.model.image.update(kind="resnet50", resnet_width=16)
+            image |= {"kind": "resnet50", "resnet_width": 16}
+        config = config.replace(model={"image": image})
     if length == "short":
-        config.simulation.update(
-            train_sequences=4, test_sequences=2, frames_per_sequence=2
+        config = config.replace(
+            simulation={
+                "train_sequences": 4,
+                "test_sequences": 2,
+                "frames_per_sequence": 2,
+            }
         )
     return config
 
 
-def _add_camera(config: ConfigDict) -> None:
-    full = _load_neighbor("dinorade").get_config()
-    axes = LiftingAxes.of_grid(
-        SimulationConfig.from_mapping(config.simulation).make_grid()
+def _with_camera(config: Config, simulation: SimulationOptions) -> Config:
+    """Return a config of DinoRADE with the radar branch of another config."""
+    axes = QueryGridOptions.of_grid(simulation.make_grid())
+    model = DinoRadeOptions(
+        **dict(config.model) | {"name": "dinorade"},
+        image=ImageOptions(
+            size=(simulation.image_height, simulation.image_width),
+            hidden_size=128,
+            num_layers=4,
+            num_heads=4,
+            mlp_dim=256,
+            num_registers=0,
+        ),
+        # No necks before the attention and fewer sampling points halve the time.
+        fusion=FusionOptions(num_elevation=4, num_points=2, necks=False),
+        # Four segments over the sensor's 36 degrees would lie above and below the cars.
+        query_grid=axes.replace(elevation_deg=(-6.0, 6.0)),
     )
-    config.data.camera = full.data.camera
-    config.model.name = "dinorade"
-    config.model.image = full.model.image
-    config.model.image.update(
-        size=(config.simulation.image_height, config.simulation.image_width),
-        freeze=False,  # trained from scratch, without downloads
-        hidden_size=128,
-        num_layers=4,
-        num_heads=4,
-        mlp_dim=256,
-        num_registers=0,
-    )
-    config.model.fusion = full.model.fusion
-    # No necks before the attention and fewer sampling points halve the time.
-    config.model.fusion.update(num_elevation=4, num_points=2, necks=False)
-    config.model.query_grid = ConfigDict(
-        {
-            name: getattr(axes, name)
-            for name in ("range_m", "azimuth_deg", "elevation_deg")
-        }
-    )
-    # Four segments over the sensor's 36 degrees would lie above and below the cars.
-    config.model.query_grid.elevation_deg = (-6.0, 6.0)
+    return config.replace(model=model, data={"camera": CameraOptions()})

@@ -38,9 +38,7 @@ attention, because the paper says that attention helps once neck and heads are c
 no other row would show that.
 """
 
-from ml_collections import ConfigDict
-
-from radejax.core.config import base_config, parse_options
+from radejax.config import Config, parse_options
 from radejax.core.structures import WIDE_ROI
 
 _OFF = {"cbam": "off", "neck": "plain", "heads": "default"}
@@ -106,6 +104,13 @@ SIGMAS = {
 
 CLASS_SETS = ("all", "sedan")
 
+SEDAN = {
+    "classes": ("Sedan",),
+    "model.num_classes": 1,
+    "data.label_version": "v1.1",
+}
+"""Fields of the option `sedan`."""
+
 RELEASES = {
     name: {
         "data.release": name,
@@ -117,22 +122,20 @@ RELEASES = {
 """Fields for K-Radar's reduced releases, see `radejax.data.reduced`."""
 
 
-def get_config(arg: str | None = None) -> ConfigDict:
+def get_config(arg: str | None = None) -> Config:
     """Return the complete config; see the module docstring for `arg`."""
     variant, preset, sigma, classes, release = parse_options(
         arg, VARIANTS, PRESETS, SIGMAS, CLASS_SETS, RELEASES
     )
-    config = base_config()
+    config = Config()
     if preset is not None:
-        config.update_from_flattened_dict(PRESETS[preset])
+        config = config.with_fields(PRESETS[preset])
     # The variant comes last, as the base row has no attention with any preset.
-    config.model.update(VARIANTS[variant or "model"])
+    config = config.replace(model=VARIANTS[variant or "model"])
     if sigma is not None:
-        config.loss.update(SIGMAS[sigma])
+        config = config.replace(loss=SIGMAS[sigma])
     if release is not None:
-        config.update_from_flattened_dict(RELEASES[release])
+        config = config.with_fields(RELEASES[release])
     if classes == "sedan":
-        config.classes = ("Sedan",)
-        config.model.num_classes = 1
-        config.data.label_version = "v1.1"
+        config = config.with_fields(SEDAN)
     return config

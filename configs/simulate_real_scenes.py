@@ -8,18 +8,16 @@ becomes a simulated radar frame, with K-Radar's split. `docs/reports/2026-11-22_
 the expected numbers and those of a CFAR detector.
 """
 
-from ml_collections import ConfigDict
+from radejax.config import Config, parse_options
+from radejax.losses.detection import LossOptions
+from radejax.models.options import RadeNetOptions
+from radejax.simulation.config import SimulationOptions
 
-from radejax.core.config import base_config, parse_options
-from radejax.simulation.config import default_config
 
-
-def get_config(arg: str | None = None) -> ConfigDict:
+def get_config(arg: str | None = None) -> Config:
     """Return the complete config; there are no variants."""
     parse_options(arg)
-    config = base_config()
-    config.simulation = ConfigDict(default_config())
-    config.simulation.update(
+    simulation = SimulationOptions(
         scenes="labels_v2_1.zip",
         frame_stride=15,
         frames_per_sequence=0,
@@ -27,29 +25,34 @@ def get_config(arg: str | None = None) -> ConfigDict:
         image_height=180,
         output="projection",
     )
-    grid = config.simulation.grid
-    config.data.mirror_probability = 0.5
-    config.model.update(
-        doppler_bins=grid.num_doppler,
-        elevation_bins=grid.num_elevation,
-        widths=(32, 64, 128),
-        decoder_width=32,
-        num_groups=8,
-        heatmap_prior=0.02,
+    grid = simulation.make_grid()
+    return Config(
+        simulation=simulation,
+        model=RadeNetOptions(
+            doppler_bins=grid.num_doppler,
+            elevation_bins=grid.num_elevation,
+            widths=(32, 64, 128),
+            decoder_width=32,
+            num_groups=8,
+            heatmap_prior=0.02,
+        ),
+        loss=LossOptions(heatmap_sigma_bins=1.0),
+    ).replace(
+        data={"mirror_probability": 0.5},
+        train={
+            "batch_size": 4,
+            "num_epochs": 4,
+            "warmup_steps": 20,
+            "log_every_steps": 20,
+            "checkpoint_every_steps": 100,
+        },
+        evaluation={
+            "score_threshold": 0.05,
+            "protocols": (
+                "all_point",
+                "kradar_r40",
+                "kradar_r40_corrected",
+                "coco101",
+            ),
+        },
     )
-    config.loss.heatmap_sigma_bins = 1.0
-    config.train.update(
-        batch_size=4,
-        num_epochs=4,
-        warmup_steps=20,
-        log_every_steps=20,
-        checkpoint_every_steps=100,
-    )
-    config.evaluation.score_threshold = 0.05
-    config.evaluation.protocols = (
-        "all_point",
-        "kradar_r40",
-        "kradar_r40_corrected",
-        "coco101",
-    )
-    return config

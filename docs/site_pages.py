@@ -5,21 +5,28 @@
 
 README, CHANGELOG, CONTRIBUTING and the notebooks keep their places in the repository. The
 reference is generated: a page per package of `radejax/` from its docstrings, a page of all
-commands from their options, and a page of all config fields from `radejax/core/config.py`.
+commands from their options, and a page of all config fields from the classes of options.
 The second command lists the public names that a built site lacks, and fails if there are any.
 """
 
 import ast
+import inspect
+import itertools
 import pathlib
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import click
-from ml_collections.config_flags import config_path
 
 from radejax.cli.main import main
-from radejax.core.config import fields_of, load_config
+from radejax.config import Config, load_config
+from radejax.core.options import Options
+from radejax.data.cameras import CameraOptions
+from radejax.data.options import DataOptions
+from radejax.models.options import DinoRadeOptions, RadeNetOptions
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 HOME = {"README.md": "index.md"}
@@ -83,56 +90,130 @@ def commands(group: click.Group, path: str) -> Iterator[tuple[str, click.Command
 
 
 def config_page() -> str:
-    """All fields of the bundled configs: type, values of the presets, meaning."""
+    """All sections of the config: type, default and meaning of their fields, and presets."""
     parts = [
         "# Config fields",
         "Every field can be set on the command line, for example "
-        "`--config.train.batch_size=4`. [Differences](../deviations.md) explains where the "
-        "paper and the released code disagree.",
+        '`--config.train.batch_size=4`, or with `config.replace(train={"batch_size": 4})` in '
+        "[Python](../training.md#write-a-config-file). A wrong type or value is an error.",
     ]
-    comments: dict[str, str] = {}
-    for path in ("radejax/core/config.py", "configs/dinorade.py"):
-        comments |= field_comments((ROOT / path).read_text(encoding="utf-8"))
-    known: dict[str, str] = {}
-    for name, title in (
-        ("radenet", "RADE-Net"),
-        ("dinorade", "DinoRADE: further fields, and those with other values"),
-    ):
-        path = str(ROOT / "configs" / f"{name}.py")
-        configs = [load_config(path + end) for end in ("", ":paper", ":official")]
-        rows = ["| field | type | default | paper | official | meaning |"]
-        rows.append("|---|---|---|---|---|---|")
-        for field, kind in fields_of(configs[0]):
-            values = [config_path.get_value(field, config) for config in configs]
-            cells = [f"`{field}`", kind.__name__, *(f"`{value!r}`" for value in values)]
-            cells.append(comments[re.sub(r"weights\..*", "weights", field)])
-            row = f"| {' | '.join(cells)} |"
-            if known.get(field) != row:
-                rows.append(row)
-            known[field] = row
-        parts += [f"## {title}", "\n".join(rows)]
-    return "\n\n".join(parts) + "\n"
+    for section, options in sections(Config()):
+        rows = ["| field | type | default | meaning |", "|---|---|---|---|"]
+        meanings = field_docstrings(type(options))
+        for name, field in type(options).model_fields.items():
+            value, kind = getattr(options, name), section_class(field.annotation)
+            if kind is None:
+                kind_text = type_text(field.annotation, field.metadata)
+            else:  # the fields have a table of their own
+                kind_text = "section" + " or None" * (value is None)
+                value = value and (value.model_extra or "")
+            cells = [f"`{section}{name}`", kind_text, code(value), meanings[name]]
+            rows.append(table_row(cells))
+        title = section.removesuffix(".") or "Top level"
+        parts += [f"## {title}", inspect.getdoc(type(options)) or "", "\n".join(rows)]
+    return "\n\n".join([*parts, presets_text()]) + "\n"
 
 
-def field_comments(source: str) -> dict[str, str]:
-    """The comment above every field of a config module, by the field's dotted name."""
-    found, above, section = {}, [], ""
-    for line in source.splitlines():
-        if match := re.match(r"def _(\w+)\(", line):
-            sections = {"camera": "data.camera", "axes": "model.query_grid"}
-            section = f"{sections.get(match[1], match[1])}."
-        if match := re.match(r"    (model\.\w+) = ConfigDict", line):
-            section = f"{match[1]}."
-        if match := re.match(r'    "(\w+)": \{$', line):
-            section = f"{match[1]}."
+def sections(options: Options, prefix: str = "") -> Iterator[tuple[str, Options]]:
+    """The sections of a config by the beginning of their fields' names.
+
+    Those of DinoRADE and those that are None by default have their classes' defaults.
+    """
+    yield prefix, options
+    if type(options) is RadeNetOptions:
+        options = DinoRadeOptions()
+    for name, field in type(options).model_fields.items():
+        if kind := section_class(field.annotation):
+            yield from sections(getattr(options, name) or kind(), f"{prefix}{name}.")
+
+
+def section_class(annotation: Any) -> type[Options] | None:
+    """The class of options that a field has, with or without None; otherwise None."""
+    kinds = [x for x in get_args(annotation) or (annotation,) if x is not NoneType]
+    is_one = len(kinds) == 1 and isinstance(kinds[0], type)
+    return kinds[0] if is_one and issubclass(kinds[0], Options) else None
+
+
+def field_docstrings(cls: type[Options]) -> dict[str, str]:
+    """The docstring below every field of a class and of those that it is derived from."""
+    found = {}
+    for base in reversed(cls.__mro__):
+        if not issubclass(base, Options):
             continue
-        if line.lstrip().startswith("# "):
-            above.append(line.strip("# "))
-            continue
-        if match := re.match(r'\s+"(\w+)":', line):
-            found[f"{section}{match[1]}"] = " ".join(above).replace("|", "\\|")
-        above = []
+        (node,) = ast.parse(inspect.getsource(base)).body
+        for field, text in itertools.pairwise(node.body):
+            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
+                meaning = " ".join(ast.literal_eval(text.value).split())
+                found[field.target.id] = meaning
     return found
+
+
+def type_text(annotation: Any, limits: Iterable[Any] = ()) -> str:
+    """Type and range of an annotation, such as "float above 0 or None"."""
+    arguments, origin = get_args(annotation), get_origin(annotation)
+    if origin is Annotated:
+        return type_text(arguments[0], (*annotation.__metadata__, *limits))
+    if origin is Literal:
+        return ", ".join(map(code, arguments))
+    if origin in (Union, UnionType):
+        return " or ".join(map(type_text, arguments))
+    if annotation is NoneType:
+        return "None"
+    names = ("ge", "gt", "le", "lt", "min_length")
+    bounds = {
+        name: getattr(x, name) for x in limits for name in names if hasattr(x, name)
+    }
+    if origin is tuple:
+        *first, last = arguments
+        kinds = dict.fromkeys(map(type_text, first if last is ... else arguments))
+        count = "" if last is ... else f"{len(arguments)} "
+        if least := bounds.get("min_length"):
+            count = f"{least} or more "
+        return f"tuple of {count}{' and '.join(kinds)}"
+    if origin is dict:
+        return f"dictionary of {type_text(arguments[1])}"
+    if issubclass(annotation, Options):
+        return f"fields of `{annotation.__name__}`"
+    if {"ge", "le"} <= bounds.keys():
+        return f"{annotation.__name__} from {bounds['ge']} to {bounds['le']}"
+    words = {"ge": "at least", "gt": "above", "lt": "below"}
+    ranges = [f"{words[name]} {x}" for name, x in bounds.items() if name in words]
+    return " ".join([annotation.__name__, " and ".join(ranges)]).strip()
+
+
+def presets_text() -> str:
+    """A table of the fields whose values in the presets are not the defaults."""
+    names = [
+        f"{name}{end}"
+        for name in ("radenet", "dinorade")
+        for end in ("", ":paper", ":official")
+    ]
+    presets = [dict(load_config(name).fields()) for name in names]
+    default = Config(model=DinoRadeOptions(), data=DataOptions(camera=CameraOptions()))
+    rows = [f"| field | default | {' | '.join(names)} |", "|---" * 8 + "|"]
+    for field, value in default.fields():
+        values = [preset.get(field, "") for preset in presets]
+        if field != "model.name" and any(x not in ("", value) for x in values):
+            rows.append(table_row([f"`{field}`", code(value), *map(code, values)]))
+    text = (
+        "Fields whose values in these configs are not the defaults. "
+        "[Differences](../deviations.md) explains where the paper and the released code "
+        "disagree."
+    )
+    return "\n\n".join(["## Presets", text, "\n".join(rows)])
+
+
+def code(value: Any) -> str:
+    """A value as code; nothing for an empty text."""
+    if isinstance(value, Options):
+        value = value.model_dump(exclude_none=True)
+    return f"`{value}`" * (value != "")
+
+
+def table_row(cells: Iterable[str]) -> str:
+    """A row of a Markdown table."""
+    escaped = (cell.replace("|", "\\|") for cell in cells)
+    return f"| {' | '.join(escaped)} |"
 
 
 def root_page(name: str) -> str:

@@ -49,11 +49,10 @@ import numpy as np
 import pretrain_backbone
 from ablation_studies import CONFIGS, STUDIES, Cell, Study
 from ablation_tables import tables
-from ml_collections import ConfigDict
 
 from radejax.cli import entry
+from radejax.config import Config, load_config
 from radejax.core import files
-from radejax.core.config import load_config, plain
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
 from radejax.data.kradar.dataset import read_split
@@ -66,6 +65,7 @@ from radejax.evaluation.report import rendered
 from radejax.evaluation.results import repair_sizes, resample, sequence_weights
 from radejax.runs import experiment
 from radejax.runs.evaluate import evaluate_run
+from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
 
 HELD_OUT_SEED = 1_000_003
@@ -93,12 +93,11 @@ class Work:
         """Returns the config fields of a run by dotted name."""
         return {"seed": seed, "simulation.seed": seed, **COMMON, **cell.fields}
 
-    def config(self, cell: Cell, seed: int) -> ConfigDict:
+    def config(self, cell: Cell, seed: int) -> Config:
         """Returns the config of a run."""
         name, _, options = cell.config.partition(":")
         config = load_config(f"{CONFIGS / name}.py:{options}")
-        config.update_from_flattened_dict(self.fields(cell, seed))
-        return config
+        return config.with_fields(self.fields(cell, seed))
 
     def run_folder(self, name: str, seed: int) -> pathlib.Path:
         """Returns the workdir of the run that a variant trains or evaluates."""
@@ -120,20 +119,29 @@ class Work:
         """Returns the folder of the training data of a seed, or of held-out scenes for None."""
         kind, name = cell.config.partition(":")[0], "held"
         if seed is not None:
-            name = f"{self.config(cell, seed).simulation.train_sequences}-seed{seed}"
+            name = f"{self.simulation(cell, seed).train_sequences}-seed{seed}"
         count = self.study.frames_per_sequence
         end = f"-{count}_frames" if count > 1 else ""
         end += f"-{cell.release.replace(' ', '')}" if cell.release else ""
         return self.out / "data" / f"{kind}-{name}{end}"
 
+    def simulation(self, cell: Cell, seed: int) -> SimulationOptions:
+        """Returns the options of the training data of a seed."""
+        options = self.config(cell, seed).simulation
+        assert options is not None
+        return options
+
     def data(self, cell: Cell, seed: int | None) -> str:
         """Simulates the data of `root` if they are missing and returns their folder."""
-        simulation = plain(self.config(cell, seed or 0).simulation)
+        simulation = self.simulation(cell, seed or 0)
         if seed is None:
-            count = self.study.frames_per_sequence
-            simulation |= {"seed": HELD_OUT_SEED, "frames_per_sequence": count}
-            simulation |= {"train_sequences": 0, "test_sequences": self.study.held_out}
-            simulation["vru_density_scale"] = 1.0  # only training scenes are scaled
+            simulation = simulation.replace(
+                seed=HELD_OUT_SEED,
+                frames_per_sequence=self.study.frames_per_sequence,
+                train_sequences=0,
+                test_sequences=self.study.held_out,
+                vru_density_scale=1.0,  # only training scenes are scaled
+            )
         root = self.root(cell, seed)
         if cell.release is None:
             simulate_dataset(simulation, root)
@@ -201,10 +209,8 @@ class Work:
         started, backbone = time.perf_counter(), self.image_backbone(cell)
         trained = folder / "evaluation" / "metrics.json"
         if not trained.exists():
-            config = self.config(cell, seed)
-            config.data.roots = (str(self.data(cell, seed)),)
-            config.data.image_backbone = backbone
-            experiment.run(config, folder)
+            data = {"roots": (self.data(cell, seed),), "image_backbone": backbone}
+            experiment.run(self.config(cell, seed).replace(data=data), folder)
         if not trained.exists():
             return False
         with self.alone():  # the held-out scenes are simulated and preprocessed once
@@ -267,7 +273,7 @@ def resampled(
         with np.load(path) as stored:
             return dict(stored)
     config = work.config(work.study.cells[name], seed)
-    classes, roi = tuple(config.classes), tuple(config.evaluation.roi)
+    classes, roi = config.classes, config.evaluation.roi
     truth, found, frames, _ = load(path.parent, Source(), classes)
     found, _ = repair_sizes(found, "false_positive")
     data = EvaluationSet(truth, found, classes=classes, frames=frames, roi=roi)

@@ -7,7 +7,7 @@ import pathlib
 from collections.abc import Mapping
 from typing import Any
 
-from radejax.core.config import load_module
+from radejax.config import load_module
 from radejax.core.structures import CLASSES
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[1] / "configs"

@@ -31,7 +31,7 @@ from radejax.data.projection import decode
 from radejax.data.records import Records, open_projections
 from radejax.evaluation.boxes import tables_from_frames
 from radejax.evaluation.report import Report, write_report
-from radejax.evaluation.results import EvaluationOptions
+from radejax.evaluation.results import ReportOptions
 from radejax.simulation.radar.tensor import RadarParameters
 
 # The middle of the ranges of the realistic radar. Another gain would shift all cross-sections and
@@ -85,7 +85,7 @@ def run_baseline(
         predictions,
         table,
         out,
-        EvaluationOptions(
+        ReportOptions(
             classes=CLASSES,
             protocols=tuple(protocols),
             iou_thresholds=(0.3, 0.5),

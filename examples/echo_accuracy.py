@@ -15,7 +15,6 @@ more bins, but does not know the Doppler bin.
 """
 
 from collections.abc import Iterator
-from typing import Any
 
 import click
 import numpy as np
@@ -26,7 +25,7 @@ from radejax.core.structures import CLASSES, NARROW_ROI
 from radejax.evaluation.boxes import in_roi
 from radejax.evaluation.report import Table, number
 from radejax.geometry.rotated_iou import bev_iou
-from radejax.simulation.config import FULL_SIZE, SimulationConfig, default_config
+from radejax.simulation.config import FULL_SIZE, SimulationOptions
 from radejax.simulation.simulator import SequenceSimulator, make_source
 
 DISTANCES_M = ((5.0, 20.0), (20.0, 40.0))
@@ -51,14 +50,14 @@ def locate(power_db: np.ndarray, cell: np.ndarray) -> np.ndarray:
 
 
 def measured(
-    config: SimulationConfig, cls: str
+    options: SimulationOptions, cls: str
 ) -> Iterator[tuple[np.ndarray, float, float]]:
     """Yields box and errors [m] in range and azimuth of visible objects in the narrow region."""
-    grid, source = config.make_grid(), make_source(config)
+    grid, source = options.make_grid(), make_source(options)
     doppler_step = grid.doppler_mps[1] - grid.doppler_mps[0]
     for name in source.numbers:
         simulator = SequenceSimulator(
-            source.make(name), grid, config.make_parameters(), config.seed
+            source.make(name), grid, options.make_parameters(), options.seed
         )
         frame = simulator.sequence.frame(0)
         given = simulator.radar_input(frame)
@@ -88,16 +87,16 @@ def overlap(boxes: np.ndarray, along: np.ndarray, across: np.ndarray) -> np.ndar
     return bev_iou(moved[:, None], boxes[:, None])[:, 0, 0]
 
 
-def table(config: SimulationConfig, cls: str) -> Table:
+def table(options: SimulationOptions, cls: str) -> Table:
     """Returns the table of errors and the fraction of overlapping boxes by distance."""
-    found = np.array([[*box, *errors] for box, *errors in measured(config, cls)])
+    found = np.array([[*box, *errors] for box, *errors in measured(options, cls)])
     boxes, along, across = np.split(found.reshape(-1, 9), (7, 8), axis=1)
     distance, rows = np.hypot(boxes[:, 0], boxes[:, 1]), []
     for low, high in DISTANCES_M:
         at = (low <= distance) & (distance < high)
         if not at.any():
             raise UserError(
-                f"{config.train_sequences} scenes have no {cls} visible to the radar"
+                f"{options.train_sequences} scenes have no {cls} visible to the radar"
                 f" at {low:g} to {high:g} m; increase --scenes"
             )
         center = np.mean(along[at])
@@ -108,7 +107,7 @@ def table(config: SimulationConfig, cls: str) -> Table:
         rows.append(
             [f"{low:g}-{high:g} m", int(at.sum()), *texts, f"{100 * share:.0f} %"]
         )
-    title = f"echo position of class {cls}, {config.make_grid().num_range} range bins"
+    title = f"echo position of class {cls}, {options.make_grid().num_range} range bins"
     head = ["Distance", "Objects", "Echo - center m", "Range m", "Azimuth m"]
     return Table(title, [*head, "IoU > 0.3"], rows)
 
@@ -131,16 +130,19 @@ def main(
     """Print median errors of the echo position and the fraction of overlapping boxes."""
     entry.set_up_jax()
     with entry.exit_codes():
-        values: dict[str, Any] = default_config()
         if full_size and range_bins:
             raise UserError(
                 "--full-size has 256 range bins and cannot be combined with --range-bins"
             )
-        values["grid"]["num_range"] = range_bins or 64
-        values |= {"seed": seed, "train_sequences": scenes, "test_sequences": 0}
-        values |= {"frames_per_sequence": 1, "vru_density_scale": 5.0}
-        values |= FULL_SIZE if full_size else {}
-        found = table(SimulationConfig.from_mapping(values), cls)
+        options = SimulationOptions(
+            seed=seed,
+            train_sequences=scenes,
+            test_sequences=0,
+            frames_per_sequence=1,
+            vru_density_scale=5.0,
+        )
+        sensor = FULL_SIZE if full_size else {"grid": {"num_range": range_bins or 64}}
+        found = table(options.replace(**sensor), cls)
         click.echo(found.render(is_simulated=True))
 
 

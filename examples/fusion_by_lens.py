@@ -26,14 +26,10 @@ from radejax.evaluation.boxes import frame_keys
 from radejax.evaluation.comparison import compare
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files import Source, load
-from radejax.evaluation.results import (
-    EvaluationOptions,
-    interval,
-    repair_sizes,
-    sequence_weights,
-)
+from radejax.evaluation.results import interval, repair_sizes, sequence_weights
 from radejax.inference.saved import load_model as open_model
 from radejax.runs.data import data_name, data_of_run
+from radejax.runs.evaluate import report_options
 from radejax.runs.figures import average_shares, frame_shares, mean_share
 from radejax.simulation.camera.lens import cover_level
 
@@ -120,19 +116,18 @@ def share_rows(share, sequence, groups, resamples):
 
 def rows_of_group(name, reports, config, chosen, resamples):
     """Returns the APs of both runs in a condition for Sedan and the mean over classes."""
-    options = config.evaluation
-    fusion, radar = (
-        evaluation_set(report, tuple(config.classes), tuple(options.roi), chosen)
-        for report in reports
-    )
-    settings = EvaluationOptions.from_config(
+    options = report_options(
         config,
         protocols=("all_point",),
-        min_score=options.score_threshold,
+        min_score=config.evaluation.score_threshold,
         bootstrap=resamples,
     )
+    fusion, radar = (
+        evaluation_set(report, options.classes, options.roi, chosen)
+        for report in reports
+    )
     runs = {"": radar[0]}, {"": fusion[0]}
-    found = compare(*runs, {"sequence": radar[1]}, settings, spaces=("bev",))
+    found = compare(*runs, {"sequence": radar[1]}, options, spaces=("bev",))
     return [
         {
             "condition": name,
@@ -176,7 +171,7 @@ def main(fusion, radar, out, data, split, resamples):
         reports = [folder / f"evaluation{name}" for folder in (fusion, radar)]
         dataset = opened.split(split)
         for report in reports:
-            frames = load(report, Source(), tuple(config.classes))[2]
+            frames = load(report, Source(), config.classes)[2]
             if frame_keys(frames) != [frame.key for frame in dataset]:
                 raise UserError(
                     f"{report} is of other frames than split {split} of "

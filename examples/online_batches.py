@@ -1,7 +1,7 @@
 """Training batches that are simulated when they are needed.
 
 The host creates scenes and scatterers, and the accelerator computes the projections of a whole
-batch in one call. A batch depends only on the config, the seed and its step, so a run can resume
+batch in one call. A batch depends only on the options, the seed and its step, so a run can resume
 from its step.
 """
 
@@ -10,7 +10,6 @@ from __future__ import annotations
 import concurrent.futures
 import functools
 import threading
-from typing import Any
 
 import grain
 import jax
@@ -20,7 +19,7 @@ import numpy as np
 from radejax.core.structures import Batch
 from radejax.core.workers import usable_cpus
 from radejax.geometry.boxes import boxes8_from_7
-from radejax.simulation.config import SimulationConfig
+from radejax.simulation.config import SimulationOptions
 from radejax.simulation.radar import tensor
 from radejax.simulation.simulator import RadarInput, SequenceSimulator, make_source
 
@@ -31,10 +30,10 @@ class OnlineBatches:
     """Endless iterator of simulated batches.
 
     Args:
-        config: Plain values as from `default_config`; its training sequences are used.
+        options: Options of the simulation, whose training sequences are used.
         batch_size: Number of frames per batch.
         max_objects: Number of rows for boxes, N of `Batch`. The nearest objects are kept.
-        seed: Seed of the choice of frames and of their noise. Scenes use the config's seed.
+        seed: Seed of the choice of frames and of their noise. Scenes use the options' seed.
         num_threads: Number of threads that compute scatterers, or None for one per CPU.
         start_step: Step of the first batch; to resume, the step that was reached.
 
@@ -46,7 +45,7 @@ class OnlineBatches:
 
     def __init__(
         self,
-        config: Any,
+        options: SimulationOptions,
         *,
         batch_size: int,
         max_objects: int,
@@ -54,10 +53,10 @@ class OnlineBatches:
         num_threads: int | None = None,
         start_step: int = 0,
     ) -> None:
-        self._config = SimulationConfig.from_mapping(config)
-        self.grid = self._config.make_grid()
-        self._parameters = self._config.make_parameters()
-        self._source = make_source(self._config)
+        self._options = options
+        self.grid = options.make_grid()
+        self._parameters = options.make_parameters()
+        self._source = make_source(options)
         self._specs = [
             (number, spec)
             for number in self._source.numbers
@@ -81,7 +80,7 @@ class OnlineBatches:
         return self.batch(self.step - 1)
 
     def batch(self, step: int) -> Batch:
-        """Returns the batch of any step; it depends only on config, seed and step."""
+        """Returns the batch of any step; it depends only on options, seed and step."""
         rng = np.random.default_rng([self._seed, step])
         chosen = rng.integers(len(self._specs), size=self._batch_size)
         rows = range(self._batch_size)
@@ -101,7 +100,7 @@ class OnlineBatches:
 
     def _make_simulator(self, number: int) -> SequenceSimulator:
         return SequenceSimulator(
-            self._source.make(number), self.grid, self._parameters, self._config.seed
+            self._source.make(number), self.grid, self._parameters, self._options.seed
         )
 
     def _frame(self, index: int, step: int, row: int):
@@ -116,7 +115,7 @@ class OnlineBatches:
         given = simulator.radar_input(frame)
         visible = simulator.is_radar_visible(frame, given)
         boxes = frame.boxes[visible].copy()
-        boxes[:, 2] -= self._config.radar_from_lidar_m[
+        boxes[:, 2] -= self._options.radar_from_lidar_m[
             2
         ]  # boxes keep the LiDAR's z, as when labels are read from files
         key = tensor.frame_key(self._seed, step, row)

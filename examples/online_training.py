@@ -17,15 +17,14 @@ import pathlib
 
 import click
 import jax
-from ml_collections import ConfigDict
 from online_batches import OnlineBatches
 
 from radejax import models
 from radejax.cli import entry
-from radejax.core.config import load_config, plain
+from radejax.config import Config, load_config
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
-from radejax.runs import checks
+from radejax.models.options import DinoRadeOptions
 from radejax.runs.experiment import checkpoint_info, claimed
 from radejax.training import distributed, loop
 from radejax.training.step import TrainState
@@ -37,7 +36,7 @@ _log = logging.getLogger(__name__)
 
 
 def train_online(
-    config: ConfigDict, workdir: str | os.PathLike, *, num_sequences: int = 1000
+    config: Config, workdir: str | os.PathLike, *, num_sequences: int = 1000
 ) -> TrainState:
     """Trains a radar model on simulated frames, or resumes the run in the workdir.
 
@@ -55,25 +54,25 @@ def train_online(
 
     Raises:
         UserError: The config has no `simulation` section, a camera model, other classes or real
-            scenes, or a field out of its range; there are several processes; or the workdir is in
-            use or belongs to a run with another config.
+            scenes; there are several processes; or the workdir is in use or belongs to a run with
+            another config.
     """
-    simulation = plain(config.get("simulation") or {})
+    simulation = config.simulation
+    if simulation is None:
+        raise UserError("online training: the config has no `simulation` section")
     for is_wrong, text in (
-        (not simulation, "the config has no `simulation` section"),
-        (simulation.get("scenes") != "procedural", "scenes must be procedural"),
-        (config.model.name == "dinorade", "the model has a camera"),
-        (tuple(config.classes) != CLASSES, f"classes must be {CLASSES}"),
+        (simulation.scenes != "procedural", "scenes must be procedural"),
+        (isinstance(config.model, DinoRadeOptions), "the model has a camera"),
+        (config.classes != CLASSES, f"classes must be {CLASSES}"),
         (jax.process_count() > 1, "one process only"),
     ):
         if is_wrong:
             raise UserError(f"online training: {text}")
-    simulation |= {
-        "train_sequences": num_sequences,
-        "test_sequences": 0,
-        "seed": simulation["seed"] + SEED_OFFSET,
-    }
-    checks.check(config)
+    simulation = simulation.replace(
+        train_sequences=num_sequences,
+        test_sequences=0,
+        seed=simulation.seed + SEED_OFFSET,
+    )
     batch_size = config.train.batch_size
     distributed.check_batch_size(batch_size)
     workdir = pathlib.Path(workdir).absolute()
@@ -121,7 +120,7 @@ def main(config, workdir, sequences, epochs):
     with entry.exit_codes():
         settings = load_config(config)
         if epochs is not None:
-            settings.train.num_epochs = epochs
+            settings = settings.replace(train={"num_epochs": epochs})
         state = train_online(settings, workdir, num_sequences=sequences)
         click.echo(f"{state.step} steps; checkpoints in {workdir / 'checkpoints'}")
 

@@ -17,17 +17,17 @@ import tempfile
 
 import click
 import numpy as np
-from ml_collections import ConfigDict
 
 import radejax
 from radejax.cli import entry
+from radejax.config import Config
 from radejax.core.archives import read_npy
-from radejax.core.config import base_config
 from radejax.core.errors import DataError, require
 from radejax.data.dataset import LabelledFrame, LabelledFrames
 from radejax.data.projection import find_problem, to_log_scale
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.simulation.config import default_config
+from radejax.models.options import RadeNetOptions
+from radejax.simulation.config import SimulationOptions
 from radejax.visualize.style import save_figure
 
 CLASSES = ("car", "truck")
@@ -123,12 +123,9 @@ def to_radar_frame(boxes: np.ndarray) -> np.ndarray:
 # Config ------------------------------------------------------------------------------
 
 
-def get_config() -> ConfigDict:
+def get_config() -> Config:
     """Returns the config of a small network."""
-    config = base_config()
-    config.classes = CLASSES
-    config.data.format = "own_radar:OwnRadar"
-    config.model.update(
+    model = RadeNetOptions(
         num_classes=2,
         doppler_bins=16,
         elevation_bins=0,
@@ -139,10 +136,14 @@ def get_config() -> ConfigDict:
         input_center=0.515,  # mean of the input, which training prints
         input_scale=20.0,
     )
-    config.loss.heatmap_sigma_bins = 1.0  # by default 3 bins; less if bins are long
-    config.train.update(batch_size=4, num_epochs=10, warmup_steps=20)
-    config.evaluation.roi = None  # by default K-Radar's lane region, 6.4 m to each side
-    return config
+    return Config().replace(
+        classes=CLASSES,
+        model=model,
+        data={"format": "own_radar:OwnRadar"},
+        loss={"heatmap_sigma_bins": 1.0},  # by default 3 bins; less if bins are long
+        train={"batch_size": 4, "num_epochs": 10, "warmup_steps": 20},
+        evaluation={"roi": None},  # by default K-Radar's lanes, 6.4 m to each side
+    )
 
 
 # Recording ---------------------------------------------------------------------------
@@ -150,20 +151,20 @@ def get_config() -> ConfigDict:
 
 def simulate(root: pathlib.Path, num_drives: int) -> None:
     """Writes a simulated recording with one frame per drive."""
-    settings = default_config() | {
-        "grid": GRID.to_dict(),
-        "radar": {"azimuth_elements": 32.0, "elevation_elements": 3.0},
-        "train_sequences": num_drives,
-        "test_sequences": 0,
-        "frames_per_sequence": 1,
-        "image_width": 0,
-    }
+    options = SimulationOptions(
+        grid=GRID.to_dict(),
+        radar={"azimuth_elements": 32.0, "elevation_elements": 3.0},
+        train_sequences=num_drives,
+        test_sequences=0,
+        frames_per_sequence=1,
+        image_width=0,
+    )
     cos, sin = np.cos(MOUNTING_YAW_RAD), np.sin(MOUNTING_YAW_RAD)
     names = {"Sedan": "car", "Bus or Truck": "truck", "Pedestrian": "pedestrian"}
     rows = [("frame", "class", *FIELDS)]
     (root / "radar").mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
-        for frame in radejax.KRadar(radejax.simulate(settings, folder), classes=names):
+        for frame in radejax.KRadar(radejax.simulate(options, folder), classes=names):
             stem = f"{frame.sequence:04d}_0001"
             power = radejax.read_tesseract(frame.radar_path)  # [D, R, 1, A]
             np.save(root / "radar" / f"{stem}.npy", power[:, :, 0].transpose(1, 2, 0))
@@ -192,9 +193,9 @@ def main(root, workdir, drives, epochs):
         frame = max(frames, key=lambda frame: len(frame.boxes))
         scene = radejax.frame_scene(frame, frame.read_projection(GRID), GRID)
         save_figure(radejax.draw_frame(scene), root / "frame.png")
-        config = get_config()
-        config.data.roots = (str(root),)
-        config.train.num_epochs = epochs or config.train.num_epochs
+        config = get_config().replace(data={"roots": (str(root),)})
+        if epochs is not None:
+            config = config.replace(train={"num_epochs": epochs})
         radejax.run(config, workdir)
 
 

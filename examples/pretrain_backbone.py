@@ -29,19 +29,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from ml_collections import ConfigDict
 
-from radejax import models
 from radejax.cli import entry
+from radejax.config import Config, load_config
 from radejax.core import files
-from radejax.core.config import load_config, plain
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
 from radejax.models.image import STRIDE, ResNetTrunk, normalize
+from radejax.models.options import DinoRadeOptions
 from radejax.models.vit import ViT
 from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibration
 from radejax.simulation.camera.shapes import camera_position
-from radejax.simulation.config import SimulationConfig
+from radejax.simulation.config import SimulationOptions
 from radejax.simulation.simulator import make_source
 from radejax.simulation.world.scene import Sequence
 from radejax.simulation.world.traffic import SIZES
@@ -94,23 +93,23 @@ def with_small_ones(sequence: Sequence, share: float, seed: int) -> Sequence:
 
 
 def draw(
-    simulation: dict[str, Any], patch: int, count: int, seed: int, share: float = 0.0
+    options: SimulationOptions, patch: int, count: int, seed: int, share: float = 0.0
 ) -> Images:
     """Renders one image of each of `count` procedural scenes; `patch` is in pixels.
 
     VRUs replace the fraction `share` of the cars, see `with_small_ones`.
     """
-    fields = {"seed": seed, "train_sequences": count, "test_sequences": 0}
-    fields |= {"frames_per_sequence": 1}
-    config = SimulationConfig.from_mapping(simulation | fields)
-    if config.scenes != "procedural" or not config.image_width:
+    options = options.replace(
+        seed=seed, train_sequences=count, test_sequences=0, frames_per_sequence=1
+    )
+    if options.scenes != "procedural" or not options.image_width:
         raise UserError(
             "simulation.scenes must be procedural and simulation.image_width above 0"
         )
-    height, width = config.image_height, config.image_width
-    cameras = stereo_calibration(config.radar_from_lidar_m, width, height)
+    height, width = options.image_height, options.image_width
+    cameras = stereo_calibration(options.radar_from_lidar_m, width, height)
     origin = camera_position(cameras[0])
-    source = make_source(config)
+    source = make_source(options)
     shape = (count, height // patch, width // patch)
     images = Images(
         np.empty((count, height, width, 3), np.uint8),
@@ -129,8 +128,8 @@ def draw(
             sequence,
             cameras,
             seed,
-            cover_lens=config.cover_lens,
-            mode=config.camera_mode,
+            cover_lens=options.cover_lens,
+            mode=options.camera_mode,
         )
         frame = sequence.frame(0)
         box = renderer.shown_boxes(frame, 0)
@@ -157,9 +156,10 @@ class Patches(nn.Module):
     def __call__(self, image: jax.Array, train: bool = False) -> jax.Array:
         features = normalize(image)
         if isinstance(self.backbone, ViT):
-            size = self.backbone.patch_size
+            options = self.backbone.options
+            size = options.patch_size
             shape = (len(image), image.shape[1] // size, image.shape[2] // size, -1)
-            tokens = self.backbone(features)[:, self.backbone.num_prefix :]
+            tokens = self.backbone(features)[:, options.num_prefix :]
             features = tokens.reshape(shape)
         else:
             features = self.backbone(features, train)
@@ -259,7 +259,7 @@ def _frozen_params(variables: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def pretrain(
-    config: ConfigDict,
+    config: Config,
     out: pathlib.Path,
     *,
     images: int = 3072,
@@ -280,13 +280,12 @@ def pretrain(
     Raises:
         UserError: The config has no images of procedural scenes, or its model has no camera.
     """
-    simulation = plain(config.get("simulation") or {})
-    if not simulation or "image" not in config.model:
+    simulation = config.simulation
+    if simulation is None or not isinstance(config.model, DinoRadeOptions):
         raise UserError("the config has no simulated images, or its model no camera")
-    detector = models.build(config.model)
-    vit = detector.vit
-    patch = STRIDE if vit is None else vit.patch_size
-    started, base = time.perf_counter(), simulation["seed"] + seed
+    image = config.model.image
+    patch = image.patch_size if image.kind == "vit" else STRIDE
+    started, base = time.perf_counter(), simulation.seed + seed
     train_data, test_data = (
         draw(simulation, patch, count, base + offset, share)
         for count, offset, share in zip(
@@ -295,7 +294,8 @@ def pretrain(
     )
     seconds = time.perf_counter() - started
     click.echo(f"{images + held_out} images rendered in {seconds:.0f} s")
-    model = Patches(vit or ResNetTrunk(detector.resnet_width, frozen=False))
+    trunk = ResNetTrunk(image.resnet_width, frozen=False)
+    model = Patches(ViT(image) if image.kind == "vit" else trunk)
     variables = train(model, train_data, epochs=epochs, seed=seed)
     found = patch_ap(model, variables, test_data)
     save(model.backbone, variables, out)

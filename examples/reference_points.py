@@ -20,7 +20,8 @@ from radejax.data.cameras import read_left_image
 from radejax.data.kradar import read_labels
 from radejax.geometry.camera import RADAR_FROM_LIDAR_M, CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.models.lifting import LiftingAxes, reference_points
+from radejax.models.lifting import reference_points
+from radejax.models.options import DinoRadeOptions
 from radejax.visualize.camera import draw_camera
 from radejax.visualize.style import save_figure
 
@@ -80,10 +81,9 @@ def main(image, calibration, label, version, out):
     with entry.exit_codes():
         camera = CameraCalibration.from_kradar(calibration)
         pixels = read_left_image(image, (camera.height, camera.width))
-        grid = RadarGrid.kradar()
-        reference = reference_points(
-            camera.camera(), LiftingAxes.of_grid(grid), grid.num_range, grid.num_azimuth
-        )
+        grid, model = RadarGrid.kradar(), DinoRadeOptions()
+        shape = grid.num_range, grid.num_azimuth, model.fusion.num_elevation
+        reference = reference_points(camera.camera(), model.query_grid, *shape)
         ground_truth = None
         if label is not None:
             labels = read_labels(label, version)

@@ -16,11 +16,11 @@ from typing import Any
 import click
 
 from radejax.cli import entry
-from radejax.core.config import plain
+from radejax.core.errors import UserError
 from radejax.evaluation.report import Table, rendered
 from radejax.inference.saved import load_model
 from radejax.runs.evaluate import evaluate_run
-from radejax.simulation.config import PRESETS
+from radejax.simulation.config import PRESETS, RadarOptions
 from radejax.simulation.dataset import simulate_dataset
 from radejax.simulation.radar.tensor import DRAWN
 
@@ -41,15 +41,19 @@ def mean_ap(
     run: pathlib.Path, radar: dict[str, Any], root: pathlib.Path, scenes: int
 ) -> float:
     """Returns the mean AP of a run on scenes of a radar, which are simulated if missing."""
-    simulation = plain(load_model(run).config.simulation)
-    own = {k: v for k, v in simulation["radar"].items() if k.endswith("_elements")}
-    simulation |= {"radar": own | radar, "seed": HELD_OUT_SEED, "output": "projection"}
-    simulation |= {
-        "train_sequences": 0,
-        "test_sequences": scenes,
-        "vru_density_scale": 1.0,
-    }
-    simulate_dataset(simulation, root)
+    simulation = load_model(run).config.simulation
+    if simulation is None:
+        raise UserError(f"{run} was not trained on simulated data")
+    own = {k: v for k, v in simulation.radar if k.endswith("_elements")}
+    options = simulation.replace(
+        radar=RadarOptions(**own | radar),
+        seed=HELD_OUT_SEED,
+        output="projection",
+        train_sequences=0,
+        test_sequences=scenes,
+        vru_density_scale=1.0,
+    )
+    simulate_dataset(options, root)
     report = evaluate_run(
         run,
         split="all",

@@ -15,11 +15,12 @@ import pathlib
 import click
 
 from radejax.cli import entry
-from radejax.core.config import load_config
+from radejax.config import load_config
 from radejax.evaluation.comparison import compare, comparison_tables
 from radejax.evaluation.files import Source, load
-from radejax.evaluation.results import EvaluationOptions, make_set
+from radejax.evaluation.results import make_set
 from radejax.runs import experiment
+from radejax.runs.evaluate import report_options
 
 CONFIG = (
     pathlib.Path(__file__).resolve().parents[1] / "configs" / "quickstart_fusion.py"
@@ -36,7 +37,7 @@ def is_met(rows, min_gain=MIN_GAIN):
 
 def compared(config, radar, fusion, resamples):
     """Returns the rows of the comparison of two evaluated workdirs."""
-    options = EvaluationOptions.from_config(
+    options = report_options(
         config,
         protocols=("all_point",),
         min_score=config.evaluation.score_threshold,
@@ -68,7 +69,7 @@ def main(workdir, options, seed, resamples):
         for kind in ("radar", "camera"):
             chosen = ["silhouettes", *(["radar"] if kind == "radar" else []), options]
             config = load_config(f"{CONFIG}:{','.join(filter(None, chosen))}")
-            config.seed = seed
+            config = config.replace(seed=seed)
             folder = pathlib.Path(workdir) / kind
             folders.append(experiment.run(config, folder))
         rows = compared(config, *folders, resamples)

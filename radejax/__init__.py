@@ -2,12 +2,42 @@
 
 import importlib
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 if sys.platform == "win32":
     raise ImportError("radejax runs on Linux and macOS; on Windows, use WSL 2")
 
 __version__ = "0.2.0"
+
+if TYPE_CHECKING:  # the names for editors and type checkers
+    from radejax.config import Config as Config
+    from radejax.config import load_config as load_config
+    from radejax.core.compilation_cache import (
+        enable_compilation_cache as enable_compilation_cache,
+    )
+    from radejax.core.errors import DataError as DataError
+    from radejax.core.errors import UserError as UserError
+    from radejax.core.structures import CLASSES as CLASSES
+    from radejax.core.structures import Batch as Batch
+    from radejax.core.structures import Boxes as Boxes
+    from radejax.core.structures import DetectionMaps as DetectionMaps
+    from radejax.core.structures import Detections as Detections
+    from radejax.data.dataset import front_view as front_view
+    from radejax.data.kradar import KRadar as KRadar
+    from radejax.data.tesseract import project_file as project_file
+    from radejax.data.tesseract import read_tesseract as read_tesseract
+    from radejax.evaluation import evaluate as evaluate
+    from radejax.geometry.radar_grid import RadarGrid as RadarGrid
+    from radejax.inference.detector import Detector as Detector
+    from radejax.inference.predict import predict_dataset as predict_dataset
+    from radejax.inference.saved import SavedModel as SavedModel
+    from radejax.inference.saved import load_model as load_model
+    from radejax.runs.data import data_of_run as data_of_run
+    from radejax.runs.experiment import run as run
+    from radejax.runs.figures import frame_scene as frame_scene
+    from radejax.simulation.dataset import simulate_dataset as simulate  # noqa: F401
+    from radejax.visualize.draw import draw_frame as draw_frame
+    from radejax.visualize.style import Scene as Scene
 
 # On first use: reading labels or evaluating files should not load the models.
 _LAZY = {
@@ -29,7 +59,8 @@ _LAZY = {
     "evaluate": "evaluation",
     "frame_scene": "runs.figures",
     "front_view": "data.dataset",
-    "load_config": "core.config",
+    "Config": "config",
+    "load_config": "config",
     "load_model": "inference.saved",
     "predict_dataset": "inference.predict",
     "project_file": "data.tesseract",
@@ -39,6 +70,10 @@ _LAZY = {
 }
 
 __all__ = list(_LAZY)
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *_LAZY]
 
 
 def __getattr__(name: str) -> Any:

@@ -205,9 +205,8 @@ def shared() -> pathlib.Path:
 @pytest.fixture(scope="session")
 def make() -> types.ModuleType:
     """Module with the seeded weights and inputs of the radar-camera golden files."""
-    from radejax.core.config import (
-        load_module,
-    )  # imported after --shapes has installed its checks
+    # Imported after --shapes has installed its checks.
+    from radejax.config import load_module
 
     return load_module(GOLDEN / "dinorade_make.py")
 

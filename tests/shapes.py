@@ -1,14 +1,13 @@
 """Checks of radejax's annotations, including array shapes, while tests run."""
 
 import functools
-from collections.abc import Callable, MutableMapping
-from typing import Any
+from collections.abc import Callable
+from typing import Any, Self
 
 import beartype
 from flax import linen as nn
 from flax import struct
 from jaxtyping import install_import_hook
-from ml_collections import ConfigDict
 
 PACKAGES = (
     "core.structures",
@@ -42,8 +41,11 @@ def check(function: Callable[..., Any]) -> Callable[..., Any]:
     """Wrap a function so that arguments and results must match its annotations.
 
     Constructors of pytrees are not checked, as JAX rebuilds these from shapes, specs and
-    None, nor are those of classes whose `__post_init__` converts arguments to arrays.
+    None, nor are those of classes whose `__post_init__` converts arguments to arrays. Neither
+    are methods that return `Self`, whose class beartype does not know here.
     """
+    if function.__annotations__.get("return") in ("Self", Self):
+        return function
     checked = _CHECKED(function)
     if function.__name__ != "__init__":
         return checked
@@ -60,7 +62,6 @@ def check(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def install() -> Any:
     """Check the modules that are imported from now on; a context manager ends it."""
-    MutableMapping.register(ConfigDict)  # it has all methods of one
     return install_import_hook(
         [f"radejax.{name}" for name in PACKAGES], f"{__name__}.check"
     )

@@ -8,10 +8,9 @@ from typing import Any
 import flax.linen as nn
 import jax
 import numpy as np
-from ml_collections import ConfigDict
 
 from radejax import Detector, models
-from radejax.core.config import base_config, load_module
+from radejax.config import Config, load_config
 from radejax.geometry.camera import CameraCalibration, stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.saved import SavedModel
@@ -39,52 +38,52 @@ def uneven_grid(**axes: np.ndarray) -> RadarGrid:
     return RadarGrid(**(fields | axes))
 
 
-def _shrink(config: ConfigDict) -> ConfigDict:
-    config.model.update(
-        doppler_bins=2,
-        elevation_bins=3,
-        widths=(8, 8),
-        decoder_width=8,
-        num_groups=4,
-        neck="plain",
-        heads="default",
-    )
-    config.decode.score_threshold = 0.3
-    return config
+_SIZES = {
+    "doppler_bins": 2,
+    "elevation_bins": 3,
+    "widths": (8, 8),
+    "decoder_width": 8,
+    "num_groups": 4,
+    "neck": "plain",
+    "heads": "default",
+}
 
 
-def shrink_run(config: ConfigDict) -> ConfigDict:
+def shrink_run(config: Config) -> Config:
     """Few bins and channels for a quickstart, so that a run takes seconds."""
-    config.simulation.grid.update(
-        num_doppler=4, num_range=24, num_elevation=3, num_azimuth=16
+    grid = {"num_doppler": 4, "num_range": 24, "num_elevation": 3, "num_azimuth": 16}
+    return config.replace(
+        simulation={"grid": grid},
+        model=_SIZES | {"doppler_bins": 4},
+        decode={"score_threshold": 0.3},
     )
-    _shrink(config).model.doppler_bins = 4
-    return config
 
 
-def write_config(path: pathlib.Path, config: ConfigDict) -> pathlib.Path:
+def write_config(path: pathlib.Path, config: Config) -> pathlib.Path:
     """Write a config as a file for `--config`."""
     path.write_text(
-        "from ml_collections import ConfigDict\n"
-        f"def get_config():\n    return ConfigDict({json.loads(config.to_json())!r})\n"
+        "from radejax.config import Config\n"
+        f"def get_config():\n    return Config(**{json.loads(config.model_dump_json())!r})\n"
     )
     return path
 
 
-def radar_config() -> ConfigDict:
-    return _shrink(base_config())
+def radar_config() -> Config:
+    return Config().replace(model=_SIZES, decode={"score_threshold": 0.3})
 
 
-def camera_config() -> ConfigDict:
+def camera_config() -> Config:
     """Config of a whole DinoRADE of small size."""
-    module = load_module(CONFIGS / "dinorade.py")
-    config = _shrink(module.get_config())
-    config.model.image.update(
-        size=IMAGE_SIZE, hidden_size=16, num_layers=1, num_heads=2, mlp_dim=16
+    image = {"hidden_size": 16, "num_layers": 1, "num_heads": 2, "mlp_dim": 16}
+    return load_config("dinorade").replace(
+        model=_SIZES
+        | {
+            "image": image | {"size": IMAGE_SIZE},
+            "fusion": {"num_heads": 2, "num_points": 2, "num_elevation": 3},
+            "query_grid": {"range_m": (1.0, 1.9), "azimuth_deg": (-50.0, 7.0)},
+        },
+        decode={"score_threshold": 0.3},
     )
-    config.model.fusion.update(num_heads=2, num_points=2, num_elevation=3)
-    config.model.query_grid.update(range_m=(1.0, 1.9), azimuth_deg=(-50.0, 7.0))
-    return config
 
 
 @functools.lru_cache(maxsize=4)
@@ -126,7 +125,7 @@ def detector(kind: str = "radar", *, num_frames: int = 1, **overrides: Any) -> D
 def saved(kind: str = "radar", **changes: Any) -> SavedModel:
     """An untrained model; `changes` are fields of its config, dots as "__"."""
     config = {"radar": radar_config, "camera": camera_config}[kind]()
-    config.update_from_flattened_dict(
+    config = config.with_fields(
         {name.replace("__", "."): value for name, value in changes.items()}
     )
     variables = _variables(kind, config.data.num_frames)

@@ -42,8 +42,7 @@ def _case(kind: str) -> tuple[Any, Batch, Any, Callable[..., Any]]:
     config = small_models.camera_config()
     if kind == "radenet":
         config = small_models.radar_config()
-    config.model.update_from_flattened_dict(KINDS[kind])
-    model = models.build(config.model)
+    model = models.build(config.model.with_fields(KINDS[kind]))
     batch = _batch(config)
     inputs = jax.tree.map(lambda x: x[:1], batch).model_inputs()
     variables = small_models.drawn(model, *inputs)
@@ -56,7 +55,7 @@ def _case(kind: str) -> tuple[Any, Batch, Any, Callable[..., Any]]:
         is_frozen=getattr(model, "is_frozen", None),
     )
     grid = models.map_grid(small_models.small_grid(), model, "true")
-    step = make_train_step(model, optimizer, grid, loss=dict(config.loss))
+    step = make_train_step(model, optimizer, grid, loss=config.loss)
     return model, batch, state, step
 
 

@@ -18,7 +18,7 @@ import pytest
 from radejax.cli import entry, main
 from radejax.cli.evaluate import evaluate
 from radejax.cli.train import train
-from radejax.core.config import load_config, override
+from radejax.config import load_config, with_texts
 
 from . import small_models as small
 
@@ -148,7 +148,17 @@ def _check_train(arguments: list[str]) -> None:
     settings = load_config(context.params["config"])
     values = {"S": "0", "LABELS.zip": "labels.zip"}
     texts = context.meta["fields"].items()
-    override(settings, {name: values.get(text, text) for name, text in texts})
+    with_texts(settings, {name: values.get(text, text) for name, text in texts})
+
+
+def test_the_config_file_of_the_page_is_read(tmp_path: pathlib.Path) -> None:
+    page = (ROOT / "docs" / "training.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"^```python\n(.*?)^```", page, re.M | re.DOTALL)
+    path = tmp_path / "own.py"
+    path.write_text(block, encoding="utf-8")
+    config = load_config(f"{path}:short")
+    assert (config.train.batch_size, config.data.weather) == (4, ("fog", "rain"))
+    assert config.loss.gwd_transform == "none"  # of the preset
 
 
 def _check_pip(arguments: list[str]) -> None:
@@ -185,8 +195,8 @@ def test_a_script_explains_itself(script: str) -> None:
 def root(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     """Two frames of one sequence, made by `radejax simulate`."""
     folder = tmp_path_factory.mktemp("commands")
-    settings = load_config("quickstart")
-    settings.simulation.update(train_sequences=1, test_sequences=0)
+    counts = {"train_sequences": 1, "test_sequences": 0}
+    settings = load_config("quickstart").replace(simulation=counts)
     config = small.write_config(folder / "tiny.py", settings)
     out = folder / "data"
     _run("simulate", "--config", config, "--frames", 2, "--out", out)

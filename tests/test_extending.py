@@ -1,5 +1,6 @@
 """Every code block of docs/extending.md is run as it is."""
 
+import importlib
 import json
 import pathlib
 import re
@@ -11,10 +12,10 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
-from ml_collections import ConfigDict
 from PIL import Image
 
 from radejax import models
+from radejax.config import Config
 from radejax.core.errors import UserError
 from radejax.data.cameras import CameraOptions
 from radejax.data.dataset import data_set
@@ -27,8 +28,8 @@ from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.inference.detect_files import detect_files
 from radejax.inference.detector import Detector
 from radejax.inference.export import export
-from radejax.runs import checks, experiment
-from radejax.runs.data import Data
+from radejax.runs import experiment
+from radejax.runs.data import Data, located
 from radejax.runs.evaluate import evaluate_run
 
 from . import small_models as small
@@ -61,23 +62,28 @@ def _forget() -> None:
         sys.modules.pop(name, None)
 
 
-def _config() -> ConfigDict:
+def _config() -> Config:
     """Config of the small model with every component of the page."""
+    parts = importlib.import_module("parts")
     config = small.radar_config()
-    config.model.update(
-        name="parts:PowerNet",
-        exponent=3,
-        backbone="parts:FlatBackbone",
-        neck="parts:StripNeck",
-        heads="parts:WideHead",
+    fields = {
+        "name": "parts:PowerNet",
+        "exponent": 3.0,
+        "backbone": "parts:FlatBackbone",
+        "neck": "parts:StripNeck",
+        "heads": "parts:WideHead",
+    }
+    return config.replace(
+        model=parts.PowerOptions(**dict(config.model) | fields),
+        loss={"own_terms": ("parts:height_loss",), "weights": {"height_loss": 0.5}},
+        data={"format": "toy:Toy"},
+        train={"batch_size": 2, "num_epochs": 1, "warmup_steps": 0},
+        evaluation={
+            "batch_size": 2,
+            "num_visualizations": 0,
+            "protocols": ("parts:EVERY_FRAME", "all_point"),
+        },
     )
-    config.loss.own_terms = ("parts:height_loss",)
-    config.loss.weights.height_loss = 0.5
-    config.data.format = "toy:Toy"
-    config.train.update(batch_size=2, num_epochs=1, warmup_steps=0)
-    config.evaluation.update(batch_size=2, num_visualizations=0)
-    config.evaluation.protocols = ("parts:EVERY_FRAME", "all_point")
-    return config
 
 
 def _write_toy(root: pathlib.Path) -> pathlib.Path:
@@ -107,9 +113,8 @@ def test_the_page_has_every_kind_of_part() -> None:
 
 
 def test_configs_may_name_the_parts_and_the_model_has_them() -> None:
-    config = _config()
-    checks.check(config)
-    model = models.build(config.model)
+    model = models.build(_config().model)
+    assert model.options.exponent == 3.0
     projection = jax.ShapeDtypeStruct((1, 16, 14, 5), "float32")
     made = jax.eval_shape(model.init, jax.random.key(0), projection)["params"]
     assert "Conv_1" in made["neck"]
@@ -120,17 +125,19 @@ def test_configs_may_name_the_parts_and_the_model_has_them() -> None:
 def test_own_models_may_have_a_camera(tmp_path: pathlib.Path) -> None:
     text = (
         "from radejax.models.dinorade import DinoRade\n"
-        "class Own(DinoRade, kw_only=True):\n    gain: float = 1.0\n"
+        "from radejax.models.options import DinoRadeOptions\n"
+        "class OwnOptions(DinoRadeOptions):\n    gain: float\n"
+        "class Own(DinoRade):\n    options: OwnOptions\n"
     )
     (tmp_path / "modules" / "parts.py").write_text(text)
-    config = small.camera_config().model
-    config.update(name="parts:Own", gain=2.0)
-    model = models.build(config)
+    sections = dict(small.camera_config())
+    fields = dict(sections.pop("model")) | {"name": "parts:Own"}
+    model = models.build(Config(**sections, model=fields | {"gain": 2.0}).model)
     assert models.has_camera(model)
     assert type(model).__name__ == "Own"
-    del config.gain
+    assert model.options.gain == 2.0
     with pytest.raises(UserError, match=r"config\.model\.gain is missing"):
-        models.build(config)
+        Config(**sections, model=fields)
 
 
 def test_the_page_shows_the_example_line_by_line() -> None:
@@ -202,16 +209,14 @@ def test_objects_that_cannot_be_learned_are_left_out_and_counted(
     boxes[1, 2], boxes[2, 4], boxes[3, 0], boxes[4, 1] = np.nan, -1.0, -12.0, 99.0
     content = dict(np.load(path)) | {"boxes": boxes, "classes": np.array(["Sedan"] * 5)}
     np.savez(path, **content)
-    config = _config()
-    config.data.roots = (str(root),)
-    data = Data(config, models.build(config.model))
-    config.data.sequences = (2,)
-    part = Data(config, models.build(config.model))
+    config = located(_config().replace(data={"roots": (str(root),)}))
+    model = models.build(config.model)
+    data = Data(config, model)
+    part = Data(config.replace(data={"sequences": (2,)}), model)
     assert [frame.sequence for frame in part.split("test")] == [2, 2]
-    config.data.sequences = (1,)  # of the train split
+    part = Data(config.replace(data={"sequences": (1,)}), model)  # of the train split
     with pytest.raises(UserError, match="no frames of the test split"):
-        Data(config, models.build(config.model)).split("test")
-    config.data.sequences = ()
+        part.split("test")
     assert data.frames[0].boxes.tolist() == [good]
     assert data.split("train")[0].classes.tolist() == ["Sedan"]
     counts = data.frames.summary().counts
@@ -220,7 +225,7 @@ def test_objects_that_cannot_be_learned_are_left_out_and_counted(
     assert counts["objects left out: field of view"] == 2
     np.savez(path, **content | {"boxes": np.array([[*good[:6], 90.0]] * 5)})
     with pytest.raises(UserError, match=r"frame 1/0001: yaw is 90, expected radians"):
-        Data(config, models.build(config.model))
+        Data(config, model)
 
 
 def test_written_folders_are_read(
@@ -263,7 +268,8 @@ def test_the_protocol_counts_every_frame() -> None:
         ("model.neck", "parts:WideHead", "expected the name of a Neck"),
         ("model.heads", "parts:height_loss", "expected the name of a Head"),
         ("model.name", "parts:StripNeck", "expected the name of a RadeNet"),
-        ("model.exponents", 2, "exponents is not a field of this model"),
+        ("model.exponents", 2.0, "exponents is not a field; did you mean .*exponent"),
+        ("model.exponent", "2", "exponent is '2', expected a number"),
         ("loss.own_terms", ("parts:focal_loss",), "has no attribute 'focal_loss'"),
         (
             "loss.own_terms",
@@ -276,20 +282,16 @@ def test_the_protocol_counts_every_frame() -> None:
     ],
 )
 def test_a_wrong_part_is_named(name: str, value: Any, message: str) -> None:
-    config = _config()
-    section, field = name.split(".")
-    config[section][field] = value
+    config, section = _config(), name.partition(".")[0]
     with pytest.raises(UserError, match=rf"^config\.{section}\..*{message}"):
-        checks.check(config)
+        config.with_fields({name: value})
 
 
 def test_an_unknown_format_is_named_with_those_that_there_are() -> None:
-    config = _config()
-    config.data.format = "nuscenes"
     with pytest.raises(
         UserError, match=r"format is 'nuscenes', expected 'kradar' or module:Object"
     ):
-        Data(config, models.build(config.model))
+        _config().replace(data={"format": "nuscenes"})
 
 
 @pytest.mark.slow
@@ -300,14 +302,15 @@ def test_own_parts_are_imported_wherever_a_run_is_opened(
     """One step on the toy data, then each command as if in a process of its own."""
     root, folder = _write_toy(tmp_path / "toy"), tmp_path / "run"
     config = _config()
-    config.data.roots = (str(root),)
-    config.classes = ("Tram", *config.classes[1:])
-    experiment.run(config, folder)
+    classes = ("Tram", *config.classes[1:])
+    experiment.run(
+        config.replace(data={"roots": (str(root),)}, classes=classes), folder
+    )
     row: dict[str, Any] = json.loads((folder / "metrics.jsonl").read_text())
     assert row["step"] == 1
     assert np.isfinite([row[name] for name in ("focal", "gwd", "height_loss")]).all()
-    config = json.loads((folder / "config.json").read_text())
-    assert config["loss"]["weights"]["height_loss"] == 0.5
+    stored = json.loads((folder / "config.json").read_text())
+    assert stored["loss"]["weights"]["height_loss"] == 0.5
     source = json.loads((folder / "evaluation" / "source.json").read_text())
     assert source["step"] == 1
     _forget()
@@ -329,7 +332,7 @@ def test_own_parts_are_imported_wherever_a_run_is_opened(
     _forget()
     detector = Detector.from_workdir(folder)
     assert type(detector.model).__name__ == "PowerNet"
-    assert detector.model.exponent == 3
+    assert detector.model.options.exponent == 3.0
     out = tmp_path / "exported"
     _forget()
     export(Detector.from_workdir(folder), out, platforms=("cpu",))

@@ -14,7 +14,7 @@ import safetensors.numpy
 from click.testing import CliRunner
 
 from radejax.cli.main import main
-from radejax.core.config import load_config, load_module
+from radejax.config import load_config, load_module
 from radejax.core.errors import DataError, UserError
 from radejax.data.pipeline import require_images
 from radejax.data.records import open_embeddings
@@ -38,25 +38,30 @@ CONFIG = pathlib.Path(__file__).parents[1] / "configs" / "quickstart_fusion.py"
 
 def small_config():
     """A few bins, small images, and the tiny DINOv3's sizes, frozen."""
-    config = load_config(f"{CONFIG}:short")
-    config.simulation.update(
-        train_sequences=2,
-        test_sequences=1,
-        frames_per_sequence=4,
-        image_width=96,
-        image_height=32,
+    return small.shrink_run(load_config(f"{CONFIG}:short")).replace(
+        simulation={
+            "train_sequences": 2,
+            "test_sequences": 1,
+            "frames_per_sequence": 4,
+            "image_width": 96,
+            "image_height": 32,
+        },
+        model={
+            "pad_multiple": 4,
+            "image": {
+                "size": (32, 96),
+                "freeze": True,
+                "hidden_size": 96,
+                "num_layers": 3,
+                "num_registers": 4,
+                "mlp_dim": 192,
+            },
+            "fusion": {"num_heads": 2, "num_elevation": 3, "necks": False},
+        },
+        data={"mirror_probability": 0.0},
+        train={"batch_size": 8, "num_epochs": 2, "log_every_steps": 1},
+        evaluation={"num_visualizations": 1},
     )
-    config = small.shrink_run(config)
-    config.model.pad_multiple = 4
-    config.model.image.update(
-        size=(32, 96), freeze=True, hidden_size=96, num_layers=3, num_registers=4
-    )
-    config.model.image.mlp_dim = 192
-    config.model.fusion.update(num_heads=2, num_elevation=3, necks=False)
-    config.data.mirror_probability = 0.0
-    config.train.update(batch_size=8, num_epochs=2, log_every_steps=1)
-    config.evaluation.num_visualizations = 1
-    return config
 
 
 @dataclasses.dataclass
@@ -66,8 +71,8 @@ class _Data:
     runs: pathlib.Path
 
     def train(self, name, config=None, init_from=None, **paths):
-        config = small_config() if config is None else config
-        config.data.update(paths, roots=(str(self.folder),))
+        data = paths | {"roots": (str(self.folder),)}
+        config = (config or small_config()).replace(data=data)
         workdir = self.runs / name
         experiment.run(config, workdir, init_from=init_from)
         return workdir
@@ -107,11 +112,10 @@ def from_images(data):
 @pytest.fixture(scope="module")
 def embeddings(data, from_images, tmp_path_factory):
     out = tmp_path_factory.mktemp("embeddings")
-    config = small_config()
-    model = build(config.model)
+    model = build(small_config().model)
     variables = image_backbone.load_image_backbone(data.backbone, model)
     frames = opened(from_images)[1].frames
-    arguments = (model, variables, config.model.image, frames, out)
+    arguments = (model, variables, frames, out)
     counts = embed_dataset(*arguments)
     assert counts == {"frames": 12, "embedded": 12, "found": 0, "missing": 0}
     counts = embed_dataset(*arguments)
@@ -170,22 +174,19 @@ def test_dinov2_embeds_and_trains_like_dinov3(data, golden, tmp_path):
         seeds.tensors(listing["tensors"]), backbone / "model.safetensors"
     )
 
-    def config():
-        changed = small_config()
-        changed.model.image.update(hidden_size=32, num_layers=2, num_heads=2)
-        changed.model.image.update(mlp_dim=128, patch_size=14, position_grid=4)
-        return changed
-
+    image = {"hidden_size": 32, "num_layers": 2, "num_heads": 2, "mlp_dim": 128}
+    image |= {"patch_size": 14, "position_grid": 4}
+    config = small_config().replace(model={"image": image})
     with pytest.raises(UserError, match=r"dinov3 is DINOv3, .* 16 there and 14 here"):
-        data.train("other", config(), image_backbone=str(data.backbone))
-    images = data.train("dinov2_images", config(), image_backbone=str(backbone))
-    path = small.write_config(tmp_path / "config.py", config())
+        data.train("other", config, image_backbone=str(data.backbone))
+    images = data.train("dinov2_images", config, image_backbone=str(backbone))
+    path = small.write_config(tmp_path / "config.py", config)
     arguments = ["embed", str(data.folder), "--config", str(path), "--out"]
     arguments += [str(embeddings), "--image-backbone", str(backbone)]
     result = CliRunner().invoke(main, arguments, catch_exceptions=False)
     assert "12 frames, 12 embedded" in result.output
     assert open_embeddings(embeddings).shape == (2, 7, 32)
-    embedded = data.train("dinov2_embedded", config(), embeddings=str(embeddings))
+    embedded = data.train("dinov2_embedded", config, embeddings=str(embeddings))
     found, wanted = data.losses(embedded), data.losses(images)
     np.testing.assert_allclose(found, wanted, rtol=2e-5)
 
@@ -246,21 +247,18 @@ def test_images_that_are_not_embedded_are_an_error(data, embeddings):
 
 
 def test_embeddings_of_another_kind_are_rejected(data, embeddings, make, tmp_path):
-    config = small_config()
-    config.model.image.standardize = False
+    config = small_config().with_fields({"model.image.standardize": False})
     with pytest.raises(UserError, match=r"standardize is True there and False here"):
-        open_embeddings(embeddings, config.model.image)
-    paths = {"roots": (str(data.folder),), "embeddings": str(embeddings)}
-    config = small_config()
-    config.data.update(paths)
-    config.data.mirror_probability = 0.5
-    with pytest.raises(UserError, match="cannot be mirrored"):
-        Data(config, build(config.model))
-    config = small_config()
-    config.data.update(paths)
-    config.model.image.freeze = False
-    with pytest.raises(UserError, match="freeze=True"):
-        Data(config, build(config.model))
+        open_embeddings(embeddings, config.model.image.to_dict())
+    paths = {"roots": (str(data.folder),), "records": str(data.folder / "records")}
+    paths["embeddings"] = str(embeddings)
+    for changes, message in (
+        ({"data.mirror_probability": 0.5}, "cannot be mirrored"),
+        ({"model.image.freeze": False}, "freeze=True"),
+    ):
+        config = small_config().replace(data=paths).with_fields(changes)
+        with pytest.raises(UserError, match=message):
+            Data(config, build(config.model))
     with pytest.raises(FileNotFoundError, match="radejax embed"):
         open_embeddings(tmp_path)
     (tmp_path / "records.json").write_text('{"shape": [2, 3]}')
@@ -274,7 +272,7 @@ def test_weights_that_do_not_fit_are_rejected(data, tmp_path):
         image_backbone.load_image_backbone(None, build(config.model))
     with pytest.raises(FileNotFoundError, match=r"lacks config.json"):
         image_backbone.load_image_backbone(tmp_path, build(config.model))
-    config.model.image.num_layers = 12
+    config = config.with_fields({"model.image.num_layers": 12})
     with pytest.raises(UserError, match=r"num_layers is 3 .* 12 here"):
         image_backbone.load_image_backbone(data.backbone, build(config.model))
     radar = build(load_config(f"{CONFIG}:radar").model)
@@ -305,7 +303,7 @@ def test_frames_without_image_are_counted_and_predicted_by_radar(
     radar = predict_dataset(detector, own.records, frames[:1], 4)
     np.testing.assert_allclose(radar["box"], half[0], rtol=1e-4, atol=1e-4)
 
-    own.camera = dataclasses.replace(own.camera, allow_missing=False)
+    own.camera = own.camera.replace(allow_missing=False)
     with pytest.raises(UserError, match="1 of 4 frames"):
         own.images(blind)
 
@@ -470,8 +468,7 @@ def test_embeddings_grow_with_a_second_disk(data, from_images, tmp_path):
             shutil.copytree(second / name, disk / name)
         else:
             shutil.copy(second / name, disk / name)
-    wrong = small_config()
-    wrong.model.image.size = (32, 80)
+    wrong = small_config().with_fields({"model.image.size": (32, 80)})
     out = tmp_path / "out"
 
     def embed(*roots, config, options=()):
@@ -489,8 +486,9 @@ def test_embeddings_grow_with_a_second_disk(data, from_images, tmp_path):
     done = embed(disk, second, config=small_config())
     assert "8 embedded, 4 found" in done.output, done.output
     assert len(open_embeddings(out).keys()) == 12
-    config = small_config()
-    config.data.update(roots=(str(disk), str(second)), embeddings=str(out))
+    paths = {"roots": (str(disk), str(second)), "embeddings": str(out)}
+    paths["records"] = str(tmp_path / "records")
+    config = small_config().replace(data=paths)
     own = Data(config, build(config.model))
     assert own.images(own.frames).image(11).dtype == np.float16
     other = embed(disk, config=wrong)

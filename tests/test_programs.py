@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from radejax.core.config import load_module
+from radejax.config import load_module
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.deformable_attention import DeformableAttention
 from tests import small_models
@@ -38,7 +38,7 @@ def facts(programs: types.ModuleType) -> Any:
     @functools.cache
     def read(kind: str, task: str, platform: str) -> dict[str, Any]:
         config = getattr(small_models, f"{kind}_config")()
-        config.model.dtype = "bfloat16"
+        config = config.replace(model={"dtype": "bfloat16"})
         function, arguments = getattr(programs, task)(config, GRID, 2)
         return programs.facts(programs.text_of(function, arguments, platform))
 
@@ -116,8 +116,8 @@ def test_simulated_rows_are_made_together(
 @pytest.mark.slow
 def test_work_is_what_the_compiler_counts(programs: types.ModuleType) -> None:
     """Operations of a radar detector, without loops that the compiler counts once."""
-    config = small_models.radar_config()
-    config.model.update(widths=(32, 32), decoder_width=32)
+    widths = {"widths": (32, 32), "decoder_width": 32}
+    config = small_models.radar_config().replace(model=widths)
     function, arguments = programs.detector(config, GRID, 1)
     found = programs.work(function, arguments, "cuda")
     ours = sum(flops * times for _, _, flops, _, times in found)

@@ -7,9 +7,8 @@ import types
 import jax
 import numpy as np
 import pytest
-from ml_collections.config_flags import config_path
 
-from radejax.core.config import fields_of, load_config, load_module
+from radejax.config import load_config, load_module
 from radejax.evaluation.report import PUBLISHED, PublishedRow
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -71,8 +70,8 @@ def test_the_page_is_short_and_in_the_navigation() -> None:
 @pytest.mark.parametrize("name", ["radenet", "dinorade"])
 def test_the_page_names_what_the_configs_change(name: str) -> None:
     paper, default, official = (
-        {field: config_path.get_value(field, config) for field, _ in fields_of(config)}
-        for config in map(load_config, (f"{name}:paper", name, f"{name}:official"))
+        dict(load_config(config).fields())
+        for config in (f"{name}:paper", name, f"{name}:official")
     )
     changed = {field for field, value in default.items() if paper[field] != value}
     changed.discard("data.camera.radar_from_lidar_z_m")  # by default that of the data
@@ -117,11 +116,11 @@ def test_lower_bounds_are_those_that_the_program_computes(
 
 def test_lower_bounds_of_a_small_training(programs: types.ModuleType) -> None:
     grid, config = small_models.small_grid(), small_models.radar_config()
-    config.train.update(batch_size=2, num_epochs=1)
+    config = config.replace(train={"batch_size": 2, "num_epochs": 1})
     hours, size = programs.least_training(config, grid)
-    config.train.num_epochs = 3
+    config = config.replace(train={"num_epochs": 3})
     assert programs.least_training(config, grid) == (pytest.approx(3 * hours), size)
-    config.train.batch_size = 4
+    config = config.replace(train={"batch_size": 4})
     _, larger = programs.least_training(config, grid)
     _, (state, *_) = programs.train_step(config, grid, 2)
     count = sum(x.size for x in jax.tree.leaves(state.params))

@@ -8,6 +8,8 @@ from types import SimpleNamespace
 import pytest
 import yaml
 
+from radejax.config import load_config
+
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 pages = SimpleNamespace(**runpy.run_path(str(ROOT / "docs" / "site_pages.py"), {}, "p"))
 
@@ -66,6 +68,18 @@ def test_links_of_root_pages_lead_to_pages_of_the_site(name: str) -> None:
             or (ROOT / "docs" / path).is_file()
             or (path.startswith("notebooks/") and (ROOT / path).is_file())
         ), target
+
+
+def test_every_config_field_is_in_the_reference() -> None:
+    text = pages.config_page()
+    for config in ("dinorade", "quickstart_fusion"):
+        names = {name for name, _ in load_config(config).fields()}
+        free = r"(loss\.weights|simulation\.grid|simulation\.radar)\..*"
+        for name in {re.sub(free, r"\1", name) for name in names}:
+            assert f"\n| `{name}` | " in text, name
+    assert "| `decode.nms_iou` | float from 0 to 1 | `0.3` | NMS removes" in text
+    assert "| `model.widths` | tuple of 1 or more int from 1 to 65536 |" in text
+    assert "| `loss.assignment` | `center` | `center` | `nms` |" in text  # presets
 
 
 def test_every_option_has_a_help_text() -> None:

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from radejax.core.config import load_config
+from radejax.config import load_config
 
 from . import small_models as small
 
@@ -46,7 +46,7 @@ def test_stages_add_up_and_are_shown(kind: str, stages: Any) -> None:
 
 
 def test_untrained_models_are_those_of_their_configs(stages: Any) -> None:
-    detector = stages.untrained(load_config(str(small.CONFIGS / "quickstart.py")))
-    assert detector.grid.projection_shape[-1] == (
-        detector.model.doppler_bins + detector.model.elevation_bins
-    )
+    detector = stages.untrained(load_config("quickstart"))
+    options = detector.model.options
+    channels = options.doppler_bins + options.elevation_bins
+    assert detector.grid.projection_shape[-1] == channels

@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from radejax.core.config import load_config
+from radejax.config import load_config
 from radejax.core.structures import DetectionMaps
 from radejax.losses.detection import detection_loss
 from radejax.models import build
@@ -23,11 +23,14 @@ def test_same_maps_from_the_same_weights(monkeypatch: pytest.MonkeyPatch) -> Non
     import networks
     import torch_dinorade
 
-    config = load_config(str(ROOT / "configs" / "dinorade.py")).model
-    config.update(widths=(8, 8, 8), decoder_width=8, num_groups=4)
-    config.image.update(size=(32, 64), hidden_size=24, num_layers=2, mlp_dim=48)
-    config.image.num_heads = 2
-    config.fusion.update(num_heads=2, num_elevation=3)
+    image = {"size": (32, 64), "hidden_size": 24, "num_layers": 2, "mlp_dim": 48}
+    config = load_config("dinorade").model.replace(
+        widths=(8, 8, 8),
+        decoder_width=8,
+        num_groups=4,
+        image=image | {"num_heads": 2},
+        fusion={"num_heads": 2, "num_elevation": 3},
+    )
     rng = np.random.default_rng(0)
     bins, channels = 8, config.doppler_bins + config.elevation_bins
     points = rng.random((1, bins, bins, 3, 2), np.float32)
@@ -37,7 +40,9 @@ def test_same_maps_from_the_same_weights(monkeypatch: pytest.MonkeyPatch) -> Non
     inputs = (x, image, ReferencePoints(points, np.ones(points.shape[:-1], bool)))
     variables = networks.random_variables(ours, *inputs)
     maps = jax.tree.leaves(ours.apply(variables, *inputs))
-    model = torch_dinorade.DinoRade(config, torch.tensor(points.reshape(-1, 3, 2)))
+    model = torch_dinorade.DinoRade(
+        config.to_dict(), torch.tensor(points.reshape(-1, 3, 2))
+    )
     state = networks.torch_state(ours, variables)
     model.load_state_dict({k: torch.tensor(v) for k, v in state.items()})
     with torch.inference_mode():
@@ -62,7 +67,7 @@ def test_same_losses_and_gradients_from_the_same_maps(
     params = rng.normal(0, 2, (2, 256, 107, 8)).astype(np.float32)
 
     def ours(maps: DetectionMaps) -> tuple[jax.Array, jax.Array]:
-        total, parts = detection_loss(maps, batch, networks.GRID, **config.loss)
+        total, parts = detection_loss(maps, batch, networks.GRID, config.loss)
         return total, parts["weighted_sum"]
 
     function = jax.jit(jax.value_and_grad(ours, has_aux=True))

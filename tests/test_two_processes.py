@@ -10,9 +10,8 @@ import time
 import chex
 import numpy as np
 import pytest
-from ml_collections import ConfigDict
 
-from radejax.core.config import load_config
+from radejax.config import Config, load_config
 from radejax.inference.saved import load_model
 from radejax.training.checkpoints import Checkpoints
 
@@ -24,14 +23,18 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 MIDDLE = 3  # of six steps
 
 
-def _config() -> ConfigDict:
-    config = small.shrink_run(load_config("quickstart:short"))
-    config.simulation.update(train_sequences=2, frames_per_sequence=5)
-    config.model.cbam = "off"
-    config.train.update(num_epochs=3, log_every_steps=1)
-    config.train.update(checkpoint_every_steps=3, checkpoints_to_keep=9)
-    config.evaluation.update(num_visualizations=0, batch_size=3)
-    return config
+def _config() -> Config:
+    return small.shrink_run(load_config("quickstart:short")).replace(
+        simulation={"train_sequences": 2, "frames_per_sequence": 5},
+        model={"cbam": "off"},
+        train={
+            "num_epochs": 3,
+            "log_every_steps": 1,
+            "checkpoint_every_steps": 3,
+            "checkpoints_to_keep": 9,
+        },
+        evaluation={"num_visualizations": 0, "batch_size": 3},
+    )
 
 
 def _start(

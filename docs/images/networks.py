@@ -22,7 +22,7 @@ import numpy as np
 from sheet import Block, Point, Sheet
 
 from radejax import models
-from radejax.core.config import load_config
+from radejax.config import load_config
 from radejax.data.cameras import no_images
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -64,7 +64,7 @@ class Network:
         model = models.build(config.model)
         inputs: tuple[Any, ...] = (np.zeros((1, *grid.projection_shape), np.float32),)
         if models.has_camera(model):
-            inputs += no_images(1, model.image_size)
+            inputs += no_images(1, model.options.image.size)
         kinds: dict[str, str] = {}
 
         def run(*inputs: Any) -> Any:
@@ -120,7 +120,8 @@ def radenet(net: Network) -> Sheet:
     levels = net.num_levels
     rows = [5.6 - 1.35 * level for level in range(levels + 1)]
     x_encoder, x_cbam, x_decoder = 5.0, 7.15, 9.3
-    doppler, elevation = net.model.doppler_bins, net.model.elevation_bins
+    options = net.model.options
+    doppler, elevation = options.doppler_bins, options.elevation_bins
     grid = RadarGrid.kradar()
     tesseract = sheet.block(
         1.05, rows[0], 1.7, 1.0, title="4D radar tensor", color=DATA,
@@ -215,7 +216,7 @@ def _neck_and_heads(
         lines=("3 × 3 peaks,", "rotated NMS"),
     )  # fmt: skip
     bins = _size(net.inputs[0].shape[:3])
-    cropped = [f"cropped to {bins}"] if net.model.crop_output else []
+    cropped = [f"cropped to {bins}"] if net.model.options.crop_output else []
     for title, shape, row in heads:
         y_head = y - 1.35 * row
         head = sheet.block(
@@ -310,7 +311,7 @@ def _fusion(
 ) -> Sheet:
     """From queries and camera map to detections."""
     top, middle, _ = rows
-    fusion = net.model.fusion
+    fusion = net.model.options.fusion
     attention = sheet.block(
         8.35, middle, 2.0, 1.15, title="Deformable attention", color=ATTENTION,
         lines=(

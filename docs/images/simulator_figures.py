@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from radejax.core.structures import CLASSES
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibration
-from radejax.simulation.config import SimulationConfig
+from radejax.simulation.config import RadarOptions
 from radejax.simulation.simulator import SequenceSimulator
 from radejax.simulation.world.traffic import make_sequence
 from radejax.visualize.draw import draw_map
@@ -37,7 +37,7 @@ SCENES = (
 )
 OFFSET = (-2.54, 0.3, 0.7)
 GRID = RadarGrid.kradar()
-PARAMETERS = SimulationConfig(grid="kradar", radar={}).make_parameters()
+PARAMETERS = RadarOptions().make_parameters()
 LIMITS_DB = (112, 145)  # from the noise to the echoes of cars
 ANGLE_LIMITS_DB = (120, 165)  # the maximum over ranges comes mostly from near objects
 SEEN = {"color": "white", "lw": 1.0, "ls": "-"}

@@ -81,7 +81,7 @@ def simulate(
 
     Example: radejax simulate --scenes labels_v2_1.zip --sequences 5,11 --out data/sim
     """
-    from radejax.simulation.config import FULL_SIZE, default_config
+    from radejax.simulation.config import FULL_SIZE, SimulationOptions
     from radejax.simulation.fitting import FITTED, fit_files
 
     entry.set_up_jax()
@@ -91,18 +91,18 @@ def simulate(
                 click.echo(f"{name}: {value}")
         click.echo(f"wrote {out / FITTED} and {out / 'fit.png'}")
         return
-    simulation = default_config()
+    simulation = SimulationOptions()
     if config is not None:
-        section = radejax.load_config(config).get("simulation")
+        section = radejax.load_config(config).simulation
         if section is None:
             raise UserError(f"{config} has no `simulation` section")
-        simulation = dict(section)
-    if full_size:
-        simulation |= FULL_SIZE
+        simulation = section
+    values = dict(simulation) | (FULL_SIZE if full_size else {})
     if radar is not None:
-        simulation |= read_object(radar, "grid", "radar")
+        values |= read_object(radar, "grid", "radar")
     fields["sequences"] = sequence_numbers
-    simulation |= {name: value for name, value in fields.items() if value is not None}
+    values |= {name: value for name, value in fields.items() if value is not None}
+    simulation = SimulationOptions(**values)
     radejax.simulate(simulation, out, num_workers=num_workers)
     click.echo(f"simulated dataset in {out}")
 
@@ -324,6 +324,7 @@ def embed(
     """
     from radejax import models
     from radejax.inference.predict import embed_dataset
+    from radejax.models.dinorade import DinoRade
     from radejax.runs.data import located, simulate_missing
     from radejax.weights.image_backbone import load_image_backbone
 
@@ -332,6 +333,7 @@ def embed(
     model = models.build(settings.model)
     variables = load_image_backbone(image_backbone, model)
     assert variables is not None  # because a path is given
+    assert isinstance(model, DinoRade)  # others have no image backbone to load
     if not roots:
         settings = located(settings)
         simulate_missing(settings)
@@ -339,11 +341,10 @@ def embed(
     counts = embed_dataset(
         model,
         variables,
-        settings.model.image,
         radejax.KRadar(roots, version=settings.data.label_version, **part),
         out,
         dtype=dtype,
-        resize=settings.data.camera.resize,
+        resize=settings.data.used_camera.resize,
         batch_size=batch_size,
     )
     click.echo(", ".join(f"{number:,} {name}" for name, number in counts.items()))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import pathlib
+from collections.abc import Iterable
 from typing import Any
 
 import click
@@ -232,20 +233,21 @@ def _given(options: dict[str, Any]) -> dict[str, Any]:
 
 
 def _settings(path: Any, given: dict[str, Any], bootstrap: int) -> tuple[Any, Any]:
-    """Builds `Source` and `EvaluationOptions` from the options that are their fields.
+    """Builds `Source` and `ReportOptions` from the options that are their fields.
 
     Options that are not given are those of the report in `path` or of the ground truth.
     """
     from radejax.evaluation.files import Source, stored_options
-    from radejax.evaluation.results import EvaluationOptions
+    from radejax.evaluation.results import ReportOptions
 
     values: dict[str, Any] = {"label_version": "v2.1"}
     for place in filter(None, (given.get("ground_truth"), path)):
         values |= stored_options(place)
     values |= {"bootstrap": bootstrap} | given
 
-    def made(kind: Any, values: dict[str, Any]) -> Any:
-        names = [field.name for field in dataclasses.fields(kind)]
+    def made(kind: Any, names: Iterable[str], values: dict[str, Any]) -> Any:
         return kind(**{name: values[name] for name in names if name in values})
 
-    return made(Source, given), made(EvaluationOptions, values)
+    sources = [field.name for field in dataclasses.fields(Source)]
+    source = made(Source, sources, given)
+    return source, made(ReportOptions, ReportOptions.model_fields, values)

@@ -163,7 +163,7 @@ def view(
     shown = complete[:max_frames]
     detector = None if workdir is None else radejax.Detector.from_workdir(workdir)
     if detector is not None:
-        release = detector.saved.config.data.get("release")
+        release = detector.saved.config.data.release
         check_release(frames.release, release, f"radar data in {', '.join(roots)}")
     bar = tqdm.tqdm(shown, desc="record", unit="frame")
     grid = frames.grid if detector is None else detector.grid
@@ -208,19 +208,19 @@ def demo(out: pathlib.Path, seed: int) -> None:
     Example: radejax demo --out demo.png
     """
     from radejax.core.structures import NARROW_ROI
-    from radejax.simulation.config import default_config
+    from radejax.simulation.config import SimulationOptions
     from radejax.visualize.style import figure_format, save_figure
 
     figure_format(out)  # checks the ending before the frame is simulated
     entry.set_up_jax()
-    simulation = default_config() | {
-        "seed": seed,
-        "train_sequences": 0,
-        "test_sequences": 1,
-        "frames_per_sequence": 1,
-        "image_width": 1280,
-        "image_height": 720,
-    }
+    simulation = SimulationOptions(
+        seed=seed,
+        train_sequences=0,
+        test_sequences=1,
+        frames_per_sequence=1,
+        image_width=1280,
+        image_height=720,
+    )
     with tempfile.TemporaryDirectory() as folder:
         frames = radejax.KRadar([radejax.simulate(simulation, folder)])
         (frame,) = frames

@@ -100,14 +100,13 @@ def train(
 
     Example: radejax train --config radenet:official --data /disk1/kradar,/disk2/kradar
     """
-    from radejax.core.config import config_name, load_config, override
+    from radejax.config import config_name, load_config, with_texts
     from radejax.runs.experiment import run, run_seeds
     from radejax.training.distributed import end_with_others
 
-    settings = load_config(config)
-    override(settings, ctx.meta["fields"])
+    settings = with_texts(load_config(config), ctx.meta["fields"])
     data["sequences"] = sequence_numbers
-    settings.data.update({name: value for name, value in data.items() if value})
+    settings = settings.replace(data={name: x for name, x in data.items() if x})
     entry.set_up_jax()
     place = coordinator, num_processes, process_id
     workdir = workdir or f"runs/{config_name(config)}"

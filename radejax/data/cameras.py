@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 import io
 import math
 import pathlib
-from collections.abc import Mapping
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import UInt8
 
-from radejax.core import errors
 from radejax.core.archives import wrap_read_errors
-from radejax.core.errors import DataError, one_of, or_none
+from radejax.core.errors import DataError
+from radejax.core.options import Options
 from radejax.geometry.camera import (
     LOOKING_AHEAD,
     Camera,
@@ -22,14 +20,6 @@ from radejax.geometry.camera import (
     ImageKind,
     stack_cameras,
 )
-
-_FINITE: errors.Range = math.isfinite, "a finite number"
-_OPTIONS = {
-    "projection": one_of("raw", "pinhole"),
-    "calibration": one_of("sequence", "common"),
-    "radar_from_lidar_m": or_none(errors.several(_FINITE, "three finite numbers", 3)),
-    "radar_from_lidar_z_m": or_none(_FINITE),
-}
 
 IMAGE_SIZE = (720, 1280)
 """Height and width of the left half of K-Radar's 2560 x 720 stereo images."""
@@ -85,42 +75,25 @@ def read_left_image(
         return np.asarray(image)
 
 
-@dataclasses.dataclass(frozen=True)
-class CameraOptions:
-    """Options for images and calibrations (`config.data.camera`).
-
-    Attributes:
-        projection: "raw" or "pinhole" (see `CameraCalibration.camera`).
-        radar_from_lidar_m: Translation t of `p_radar = p_lidar + t` for all frames, or
-            None for each frame's own.
-        radar_from_lidar_z_m: z of each frame's own t in the camera projection, or None
-            for the z of the mounting positions. The boxes are not moved by it. Unused
-            with `radar_from_lidar_m`.
-        calibration: "sequence" for the calibration file of each sequence, if it has one;
-            "common" for `cam_front0.yml` in all sequences, as in the released code.
-        resize: Whether to resize images (and their calibrations) of another size than
-            the model's; otherwise such an image is an error.
-        allow_missing: Whether frames without an image or a calibration are predicted
-            from the radar only; otherwise such a frame is an error.
-
-    Raises:
-        UserError: An option has an invalid value.
-    """
+class CameraOptions(Options, section="config.data.camera"):
+    """Options of images and calibrations."""
 
     projection: ImageKind = "raw"
+    """raw (with lens distortion) or pinhole (without, as released)."""
     radar_from_lidar_m: tuple[float, float, float] | None = None
+    """Translation t of `p_radar = p_lidar + t` in meters for all frames; None: each
+    frame's own."""
     radar_from_lidar_z_m: float | None = None
+    """z of t in the camera projection, which does not move boxes; None: K-Radar's 0.7, or
+    the simulation's. Unused with `radar_from_lidar_m`."""
     calibration: Literal["sequence", "common"] = "sequence"
+    """sequence (each sequence's own) or common (cam_front0.yml, as released)."""
     resize: bool = False
+    """Resize images, and their calibrations, of another size than `model.image.size`;
+    otherwise such an image is an error."""
     allow_missing: bool = True
-
-    def __post_init__(self) -> None:
-        errors.check_options(vars(self), "config.data.camera", _OPTIONS)
-
-    @classmethod
-    def from_config(cls, data: Mapping[str, Any]) -> CameraOptions:
-        """Returns the options in `config.data`, or the defaults if it has no camera."""
-        return cls(**data.get("camera", {}))
+    """Predict frames without an image or a calibration from the radar only; otherwise such a
+    frame is an error."""
 
     def shift(self, own_m: Any, own_z_m: float) -> tuple[float, ...]:
         """Returns the translation t of `p_radar = p_lidar + t` for one frame.

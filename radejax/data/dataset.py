@@ -16,8 +16,8 @@ from typing import Any, Self, TypeVar
 import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 
-from radejax.core.config import find_part
 from radejax.core.errors import UserError
+from radejax.core.options import find_part
 from radejax.data.cameras import IMAGE_SIZE, read_left_image
 from radejax.data.tesseract import read_frame
 from radejax.geometry.camera import CameraCalibration

@@ -13,10 +13,12 @@ from typing import Any, Literal, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pydantic
 from flax import struct
 from jaxtyping import Bool, Float, Num, Real
 
-from radejax.core.errors import check_options, integer, number, one_of, or_none
+from radejax.core.errors import require
+from radejax.core.options import AtLeastOne, Fraction, Options
 from radejax.core.structures import MIN_SIZE_M, Array, DetectionMaps, Detections
 from radejax.detection.nms import rotated_nms
 from radejax.geometry.boxes import boxes7_from_8
@@ -27,34 +29,33 @@ Roi = Real[Array, "6"] | Sequence[Scalar]
 RawYaw = Literal["nms", "always", "never"]
 
 
-@dataclasses.dataclass(frozen=True)
-class DecodeOptions:
-    """Arguments of `decode` that `config.decode` can set.
+class DecodeOptions(Options, section="config.decode"):
+    """Arguments of `decode` that the config can set."""
 
-    Raises:
-        UserError: A value is out of range.
-    """
-
-    max_detections: int = 100
-    score_threshold: float = 0.3
+    max_detections: AtLeastOne = 100
+    """Rows of the output per frame."""
+    score_threshold: Fraction = 0.3
+    """Score threshold."""
     threshold_inclusive: bool = True
-    nms_iou: float = 0.3
+    """Keep scores equal to the threshold."""
+    nms_iou: Fraction = 0.3
+    """NMS removes a box whose IoU with a better box is at least this."""
     per_class_nms: bool = False
+    """Apply NMS to each class separately."""
     roi: tuple[float, ...] | None = None
+    """Region of interest: x0, x1, y0, y1, z0, z1 in meters. Boxes whose center is
+    outside are removed before NMS. None: everywhere."""
     raw_yaw: RawYaw = "nms"
+    """Where the length of the regressed yaw vector scales a box: nms (in NMS only),
+    always (in the results too, as in the released evaluator), never."""
     clip_sizes: bool = True
+    """Clip sizes to at least 0.01 m."""
 
-    def __post_init__(self) -> None:
-        ranges = {
-            "max_detections": integer(1),
-            "score_threshold": number(0, 1),
-            "nms_iou": number(0, 1),
-            "roi": or_none(
-                (lambda roi: is_roi(roi) and bool(np.isfinite(roi).all()), ROI_LIMITS)
-            ),
-            "raw_yaw": one_of(*get_args(RawYaw)),
-        }
-        check_options(vars(self), "config.decode", ranges)
+    @pydantic.model_validator(mode="after")
+    def _check(self) -> DecodeOptions:
+        is_fine = self.roi is None or is_roi(self.roi)
+        require(is_fine, "config.decode.roi", self.roi, f"{ROI_LIMITS}, or None")
+        return self
 
 
 ROI_LIMITS = "six numbers x0 < x1, y0 < y1, z0 < z1"

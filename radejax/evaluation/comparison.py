@@ -35,7 +35,7 @@ from radejax.evaluation.evaluation_set import SPACES, EvaluationSet
 from radejax.evaluation.files import Source, load, report_folders, stored_options
 from radejax.evaluation.results import (
     LEVEL,
-    EvaluationOptions,
+    ReportOptions,
     condition_masks,
     in_one_sequence,
     interval,
@@ -106,7 +106,7 @@ def compare(
     run_a: Run,
     run_b: Run,
     frames: Columns,
-    options: EvaluationOptions,
+    options: ReportOptions,
     *,
     spaces: Sequence[str] = SPACES,
 ) -> list[Comparison]:
@@ -285,7 +285,7 @@ def compare_files(
     paths: Sequence[PathLike],
     out_dir: PathLike | None,
     source: Source,
-    options: EvaluationOptions,
+    options: ReportOptions,
 ) -> tuple[str, list[dict[str, Any]]]:
     """Compares each run with the first one on the same frames.
 
@@ -311,7 +311,7 @@ def compare_files(
     # Predictions below the lowest stored score of one run must not count for another run.
     seeds = [seed for run in folders for seed in run.values()]
     stored = (stored_options(seed).get("min_score", 0) for seed in seeds)
-    options = dataclasses.replace(options, min_score=max(options.min_score, *stored))
+    options = options.replace(min_score=max(options.min_score, *stored))
     names = [str(path) for path in paths]
     (first, frames), *others = [_load_run(run, source, options) for run in folders]
     built, rows = [], []
@@ -322,7 +322,7 @@ def compare_files(
     is_simulated = next(iter(first.values())).is_simulated
     text = report.rendered(built, is_simulated=is_simulated)
     if out_dir is not None:
-        content = {"runs": names, "options": dataclasses.asdict(options), "rows": rows}
+        content = {"runs": names, "options": options.to_dict(), "rows": rows}
         place = pathlib.Path(out_dir) / "comparison"
         files.write_text(place.with_suffix(".txt"), text)
         files.write_json(place.with_suffix(".json"), content)
@@ -331,7 +331,7 @@ def compare_files(
 
 
 def _load_run(
-    folders: Mapping[str, pathlib.Path], source: Source, options: EvaluationOptions
+    folders: Mapping[str, pathlib.Path], source: Source, options: ReportOptions
 ) -> tuple[dict[str, EvaluationSet], Columns]:
     """Returns the evaluation sets of the seeds of a run, and its frame table."""
     sets: dict[str, EvaluationSet] = {}

@@ -24,7 +24,7 @@ from radejax.evaluation import boxes
 from radejax.evaluation.boxes import Columns
 from radejax.evaluation.kitti import read_kitti
 from radejax.evaluation.report import Report, write_report
-from radejax.evaluation.results import EvaluationOptions
+from radejax.evaluation.results import ReportOptions
 
 LOW_SCORE = 0.1
 """If the lowest stored score is above this and the score threshold, a warning is given."""
@@ -273,7 +273,7 @@ def evaluate_files(
     path: PathLike,
     out_dir: PathLike,
     source: Source,
-    options: EvaluationOptions,
+    options: ReportOptions,
     *,
     run: str = "radejax",
 ) -> Report:
@@ -288,7 +288,7 @@ def evaluate_files(
             f"{path} has only predictions from score {low:g} on, and every number is of "
             "these; `radejax evaluate` with --min-score stores lower ones"
         )
-    options = dataclasses.replace(options, min_score=max(low, options.min_score))
+    options = options.replace(min_score=max(low, options.min_score))
     return write_report(
         truth,
         found,

@@ -12,8 +12,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Real
 
-from radejax.core.config import find_part
 from radejax.core.errors import require
+from radejax.core.options import find_part
 
 EMPTY_FRAMES = ("protocol", "class", "frame", "none")
 """Rules for the frames to ignore, see `evaluate`."""

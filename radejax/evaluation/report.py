@@ -37,7 +37,7 @@ from radejax.evaluation.boxes import Columns, roi_name, write_boxes
 from radejax.evaluation.evaluation_set import EvaluationSet, Result
 from radejax.evaluation.kitti import write_kitti
 from radejax.evaluation.results import (
-    EvaluationOptions,
+    ReportOptions,
     compute_results,
     condition_masks,
     exclusion_counts,
@@ -68,7 +68,7 @@ def write_report(
     predictions: Columns,
     frames: Columns,
     out_dir: PathLike,
-    options: EvaluationOptions,
+    options: ReportOptions,
     *,
     run: str = "radejax",
     left_out: Mapping[str, int] | None = None,
@@ -93,7 +93,7 @@ def write_report(
     """
     if protocols.RECOMMENDED not in options.protocols:
         names = (*options.protocols, protocols.RECOMMENDED)
-        options = dataclasses.replace(options, protocols=names)
+        options = options.replace(protocols=names)
     data = make_set(ground_truth, predictions, frames, options)
     results = compute_results(data, frames, options)
     iou = options.iou_thresholds[0]
@@ -104,7 +104,7 @@ def write_report(
     splits = np.unique(np.asarray(frames.get("split", [])).astype(str))
     metrics = {
         "run": run,
-        "options": dataclasses.asdict(options),
+        "options": options.to_dict(),
         "split": splits.item() if splits.size == 1 else None,
         "is_simulated": data.is_simulated,
         "num_frames": int(data.frame.size),
@@ -151,7 +151,7 @@ def write_report(
 
 
 def _tables(
-    metrics: Mapping[str, Any], results: Results, options: EvaluationOptions
+    metrics: Mapping[str, Any], results: Results, options: ReportOptions
 ) -> list[Table]:
     """Builds the tables in the papers' layouts, of all protocols and IoUs, and of details."""
     ious, subsets = options.iou_thresholds, metrics["subsets"]
@@ -170,7 +170,7 @@ def _tables(
 
 
 def _console_text(
-    metrics: Mapping[str, Any], results: Results, options: EvaluationOptions
+    metrics: Mapping[str, Any], results: Results, options: ReportOptions
 ) -> str:
     """Formats the most important tables for the console."""
     iou = options.iou_thresholds[0]
@@ -199,7 +199,7 @@ def _console_text(
 def _draw_curves(
     data: EvaluationSet,
     frames: Columns,
-    options: EvaluationOptions,
+    options: ReportOptions,
     folder: pathlib.Path,
 ) -> None:
     """Draws precision over recall for each class with objects, one curve per weather."""
@@ -321,7 +321,7 @@ def terms_of(results: Results, protocol: str) -> str:
 
 
 def class_by_weather(
-    results: Results, options: EvaluationOptions, protocol: str, iou: float
+    results: Results, options: ReportOptions, protocol: str, iou: float
 ) -> Table:
     """Builds the table of classes by weather in one protocol, with "3D / BEV" entries."""
     conditions = dict.fromkeys(key[1] for key in results)
@@ -337,7 +337,7 @@ def class_by_weather(
 
 
 def by_protocol(
-    results: Results, options: EvaluationOptions, space: str, iou: float
+    results: Results, options: ReportOptions, space: str, iou: float
 ) -> Table:
     """Builds the table of protocols by classes over all weathers.
 
@@ -466,7 +466,7 @@ class PublishedRow:
         self,
         cells: Sequence[Cell],
         ours: Sequence[float | None],
-        options: EvaluationOptions,
+        options: ReportOptions,
         split: str | None,
     ) -> list[str]:
         """Formats our APs minus the printed ones, with "-" if they are not comparable.
@@ -514,7 +514,7 @@ PUBLISHED = _read()
 
 
 def paper_tables(
-    run: str, results: Results, options: EvaluationOptions, split: str | None
+    run: str, results: Results, options: ReportOptions, split: str | None
 ) -> list[Table]:
     """Builds the tables in the papers' layouts that the classes and IoUs allow.
 
@@ -569,7 +569,7 @@ def _crossed(outer: Sequence[Place], inner: Sequence[Place]) -> list[Place]:
 def _layout(
     run: str,
     results: Results,
-    options: EvaluationOptions,
+    options: ReportOptions,
     split: str | None,
     title: str,
     sources: Sequence[str],

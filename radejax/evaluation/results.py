@@ -11,119 +11,94 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
+import pydantic
+from annotated_types import MinLen
 from jaxtyping import Bool, Float, Int, Shaped
-from ml_collections import ConfigDict
 
-from radejax.core.errors import (
-    BELOW_ONE,
-    UserError,
-    check_options,
-    integer,
-    number,
-    one_of,
-    several,
-)
-from radejax.core.structures import CLASSES, MIN_SIZE_M
+from radejax.core.errors import UserError, require
+from radejax.core.options import AtLeastOne, BelowOne, Count, Fraction, Options
+from radejax.core.structures import CLASSES, MIN_SIZE_M, NARROW_ROI
 from radejax.data.kradar.conditions import WEATHERS
 from radejax.evaluation import protocols
-from radejax.evaluation.boxes import AnyColumns, Columns, Roi, roi_bounds
+from radejax.evaluation.boxes import AnyColumns, Columns, roi_bounds
 from radejax.evaluation.evaluation_set import EvaluationSet, Result, mean_ap
 
 LEVEL = 0.95
 """Confidence level of all intervals."""
 
-_RANGES = {
-    "iou_thresholds": several(BELOW_ONE, "different numbers in [0, 1)", least=1),
-    "protocols": several((bool, ""), "different names, such as all_point", least=1),
-    "score_threshold": number(0, 1),
-    "empty_frames": one_of(*protocols.EMPTY_FRAMES),
-    "min_score": number(0, 1),
-    "bootstrap": integer(0),
-    "invalid_sizes": one_of("error", "false_positive"),
-    "batch_size": integer(1),
-    "num_visualizations": integer(0),
-}
+Region = Literal["narrow", "wide"] | tuple[float, ...] | None
 
 
-@dataclasses.dataclass(frozen=True)
-class EvaluationOptions:
-    """Settings of an evaluation: the fields of `config.evaluation` and of reports.
+class EvaluationOptions(Options, section="config.evaluation"):
+    """Options of every evaluation of a run."""
 
-    Attributes:
-        classes: Classes to evaluate.
-        iou_thresholds: IoU thresholds.
-        protocols: Names of protocols.
-        score_threshold: Score threshold of all protocols except fixed ones (all_point).
-        empty_frames: Frames to ignore, except in fixed protocols; see `evaluate`.
-        min_score: Minimum score; predictions below it are neither stored nor evaluated.
-        roi: Region of interest of ground truth and predictions.
-        label_version: Label revision of the ground truth.
-        bootstrap: Number of resamples of sequences for intervals; 0 for none.
-        invalid_sizes: Treatment of predicted boxes with a size that is not positive:
-            "error", or "false_positive" to count them as predictions without a match.
-        plots: Whether to draw curves.
-        batch_size: Number of frames per batch of predictions.
-        num_visualizations: Number of frames to draw.
-        figures: Format of the figures, "png" or "pdf".
-        kitti: Whether to write the boxes as text files for K-Radar's evaluation script.
-    """
+    roi: Region = NARROW_ROI
+    """Region of interest: x0, x1, y0, y1, z0, z1 in meters; None: everywhere."""
+    protocols: Annotated[tuple[str, ...], MinLen(1)] = (
+        *("coco101", "all_point", "kradar_r40"),
+    )
+    """Evaluation protocols, or module:Object; the first chooses the best checkpoint."""
+    empty_frames: Literal["protocol", "class", "frame", "none"] = "protocol"
+    """Frames that are excluded: protocol (by the protocol's own rule), class (frames
+    without an object of the class), frame (frames without any object), none."""
+    iou_thresholds: Annotated[tuple[BelowOne, ...], MinLen(1)] = (0.3, 0.5)
+    """IoU thresholds."""
+    score_threshold: Fraction = 0.3
+    """Score threshold of all protocols except all_point."""
+    min_score: Fraction = 0.05
+    """Predictions below this score are not stored."""
+    bootstrap: Count = 0
+    """Number of bootstrap resamples of sequences for 95 % confidence intervals; 0: no
+    intervals."""
+    batch_size: AtLeastOne = 8
+    """Frames per call of the detector."""
+    num_visualizations: Count = 8
+    """Number of figures of frames in a report."""
 
-    classes: tuple[str, ...] = CLASSES
-    iou_thresholds: tuple[float, ...] = (0.3, 0.5, 0.7)
-    protocols: tuple[str, ...] = tuple(protocols.PROTOCOLS)
-    score_threshold: float = 0.0
-    empty_frames: str = "protocol"
-    min_score: float = 0.0
-    roi: Roi = "narrow"
-    label_version: str | None = None
-    bootstrap: int = 0
-    invalid_sizes: str = "error"
-    plots: bool = True
-    batch_size: int = 8
-    num_visualizations: int = 8
-    figures: str = "png"
-    kitti: bool = False
-
-    def __post_init__(self) -> None:
-        check_options(vars(self), "config.evaluation", _RANGES)
+    @pydantic.model_validator(mode="after")
+    def _check(self) -> EvaluationOptions:
+        for name in ("protocols", "iou_thresholds"):
+            values = getattr(self, name)
+            is_different = len(set(values)) == len(values)
+            require(is_different, f"config.evaluation.{name}", values, "different ones")
         try:
             for name in self.protocols:
                 protocols.get_protocol(name)
             roi_bounds(self.roi)
         except UserError as error:
             raise UserError(f"config.evaluation.{error}") from None
+        return self
 
-    @classmethod
-    def from_config(cls, config: ConfigDict, **changes: Any) -> EvaluationOptions:
-        """Creates options from the config of a run.
 
-        Args:
-            config: Config of the run with `evaluation`, `classes` and `data.label_version`.
-            **changes: Fields to replace.
+class ReportOptions(EvaluationOptions):
+    """Options of one report, which may be of boxes without a run."""
 
-        Raises:
-            UserError: A value is invalid, or the run does not have one of the classes.
-        """
-        classes = tuple(config.classes)
-        if unknown := sorted(set(changes.get("classes", ())) - set(classes)):
-            raise UserError(
-                f"classes has {unknown[0]!r}, expected some of the run's: "
-                f"{', '.join(classes)}"
-            )
-        is_own = config.data.format != "kradar"
-        values = {
-            "classes": classes,
-            "label_version": None if is_own else config.data.label_version,
-            "invalid_sizes": "false_positive",
-            **config.evaluation.to_dict(),
-            **changes,
-        }
-        options = cls(**values)
-        stored_from = min(options.min_score, options.score_threshold)
-        return dataclasses.replace(options, min_score=stored_from)
+    iou_thresholds: Annotated[tuple[BelowOne, ...], MinLen(1)] = (0.3, 0.5, 0.7)
+    """IoU thresholds."""
+    protocols: Annotated[tuple[str, ...], MinLen(1)] = tuple(protocols.PROTOCOLS)
+    """Evaluation protocols."""
+    score_threshold: Fraction = 0.0
+    """Score threshold of all protocols except all_point."""
+    min_score: Fraction = 0.0
+    """Predictions below this score are neither stored nor evaluated."""
+    roi: Region = "narrow"
+    """Region of interest of ground truth and predictions."""
+    classes: tuple[str, ...] = CLASSES
+    """Classes to evaluate."""
+    label_version: str | None = None
+    """Label revision of the ground truth."""
+    invalid_sizes: Literal["error", "false_positive"] = "error"
+    """Treatment of predicted boxes with a size that is not positive: error, or
+    false_positive to count them as predictions without a match."""
+    plots: bool = True
+    """Draw curves."""
+    figures: Literal["png", "pdf"] = "png"
+    """Format of the figures."""
+    kitti: bool = False
+    """Write the boxes as text files for K-Radar's evaluation script."""
 
     @property
     def paper_protocol(self) -> str:
@@ -170,7 +145,7 @@ def make_set(
     ground_truth: Columns,
     predictions: Columns,
     frames: Columns,
-    options: EvaluationOptions,
+    options: ReportOptions,
 ) -> EvaluationSet:
     """Builds the evaluation set; repaired and clipped predictions are counted in it.
 
@@ -203,7 +178,7 @@ def make_set(
 
 
 def compute_results(
-    data: EvaluationSet, frames: Columns, options: EvaluationOptions
+    data: EvaluationSet, frames: Columns, options: ReportOptions
 ) -> list[Result]:
     """Computes the results of every protocol over all frames and the frames of weathers.
 
@@ -351,7 +326,7 @@ def condition_masks(frames: AnyColumns, kind: str) -> dict[str, Bool[np.ndarray,
     return {name: column == name for name in ordered if name in present}
 
 
-def exclusion_counts(data: EvaluationSet, options: EvaluationOptions) -> dict[str, int]:
+def exclusion_counts(data: EvaluationSet, options: ReportOptions) -> dict[str, int]:
     """Counts the boxes and frames that are excluded from the results, by reason."""
     fixed = [p for p in options.protocols if protocols.get_protocol(p).is_fixed]
     threshold = max(options.score_threshold, options.min_score)

@@ -7,7 +7,6 @@ which image belongs to each frame.
 from __future__ import annotations
 
 import csv
-import dataclasses
 import itertools
 import json
 import pathlib
@@ -152,8 +151,8 @@ def _cameras(frames: FrameSequence, detector: Detector) -> Sequence[Camera]:
     Raises:
         UserError: There are images, and no calibration for any of them.
     """
-    options = dataclasses.replace(detector.camera_options, allow_missing=True)
-    inputs = camera_inputs(frames, detector.model.image_size, options)
+    options = detector.camera_options.replace(allow_missing=True)
+    inputs = camera_inputs(frames, detector.model.options.image.size, options)
     if any(frame.camera_path is not None for frame in frames):
         require_images(frames, inputs, "dataset")
     return inputs.cameras

@@ -40,7 +40,7 @@ from radejax.data.reduced import (
     release_of_file,
 )
 from radejax.data.tesseract import read_frame
-from radejax.detection.decode import ROI_LIMITS, DecodeOptions, decode, is_roi
+from radejax.detection.decode import ROI_LIMITS, decode, is_roi
 from radejax.geometry.camera import (
     KRADAR_RADAR_FROM_LIDAR_Z_M,
     RADAR_FROM_LIDAR_M,
@@ -147,18 +147,17 @@ class Detector:
         dtype: str | None = None,
         batch_sizes: Sequence[int] = (1, 2, 4, 8, 16, 32),
     ) -> None:
-        config = saved.config.copy_and_resolve_references()
-        config.decode.update(_settings(score_threshold, nms_iou, roi))
+        config = saved.config.replace(decode=_settings(score_threshold, nms_iou, roi))
         if dtype is not None:
-            config.model.dtype = dtype
+            config = config.replace(model={"dtype": dtype})
         self.saved = dataclasses.replace(saved, config=config)
         self.grid = saved.grid
         self.model: Any = self.saved.model
         self.num_frames: int = self.model.num_frames
         self.takes_camera = models.has_camera(self.model)
-        self.camera_options = CameraOptions.from_config(config.data)
+        self.camera_options = config.data.used_camera
         self.classes = tuple(config.classes)
-        self.decode_options = dataclasses.asdict(DecodeOptions(**config.decode))
+        self.decode_options = config.decode.to_dict()
         self.sharding = sharding or SingleDeviceSharding(jax.devices()[0])
         self.replicated = self.sharding
         run = self.detect_function()
@@ -294,7 +293,7 @@ class Detector:
         if isinstance(frames, Batch):
             inputs = frames.projection, frames.image, frames.camera
         else:
-            release = self.saved.config.data.get("release")
+            release = self.saved.config.data.release
             radar = radar_batch(frames, self.grid, self.num_frames, release)
             if self.num_frames > 1:
                 shape = (-1, self.num_frames, *self.grid.projection_shape)
@@ -412,7 +411,7 @@ class Detector:
             frames: Single frames as arrays or paths.
             history: The last T - 1 projections, or None before the first frame.
         """
-        release = self.saved.config.data.get("release")
+        release = self.saved.config.data.release
         new = self._projections(radar_batch(frames, self.grid, release=release))
         past = self.num_frames - 1
         if history is None:
@@ -441,7 +440,7 @@ class Detector:
         shape = (batch_size, *steps, *self.grid.projection_shape)
         inputs: tuple[Any, ...] = (np.zeros(shape, np.float32),)
         if self.takes_camera:
-            images, camera = no_images(batch_size, self.model.image_size)
+            images, camera = no_images(batch_size, self.model.options.image.size)
             inputs += images, camera.replace(is_valid=np.ones(batch_size, bool))
         jax.block_until_ready(self(*inputs))
         return self
@@ -679,14 +678,17 @@ def _images(
     image: Any, cameras: Camera, model: Any, resize: bool
 ) -> tuple[Real[Array, "B _ _ _"], Bool[np.ndarray, " B"]]:
     """Return the images as one array, and a mask that is True where an image is given."""
-    sizes = ((*model.image_size, 3), model.feature_shape)
+    sizes = ((*model.options.image.size, 3), model.feature_shape)
     sizes_px = np.asarray(cameras.size_px, int)
 
     def read(path: pathlib.Path, index: int) -> UInt8[np.ndarray, "H W 3"]:
         # A wrong number of images is reported later.
         width, height = sizes_px[min(index, len(sizes_px) - 1)]
         return read_left_image(
-            path, model.image_size, resize=resize, calibrated_size=(height, width)
+            path,
+            model.options.image.size,
+            resize=resize,
+            calibrated_size=(height, width),
         )
 
     image = _read_paths(image, read)
@@ -716,7 +718,7 @@ def _cameras(
         return camera
     if not isinstance(camera, list | tuple):
         camera = [camera] * num_frames
-    none = no_camera(model.image_size)
+    none = no_camera(model.options.image.size)
     cameras = [none if one is None else _one_camera(one, options) for one in camera]
     return stack_cameras(cameras)
 

@@ -31,6 +31,7 @@ from radejax.inference import exported_loader
 from radejax.inference.detector import SETTINGS, Detector
 from radejax.inference.saved import save_model
 from radejax.models.dinorade import IMAGE_BACKBONE
+from radejax.models.options import DinoRadeOptions
 
 PLATFORMS = ("cpu", "cuda", "tpu")
 KNOWN_PLATFORMS = (*PLATFORMS, "rocm")
@@ -116,7 +117,7 @@ def export(
     is_possible = detector.num_frames == 1 or not is_tensor
     require(is_possible, "input", radar_input, expected)
     saved = detector.saved
-    release = saved.config.data.get("release")
+    release = saved.config.data.release
     expected = f"projection, as the model is for {release} files"
     require(not (release and is_tensor), "input", radar_input, expected)
     *bins, channels = grid.projection_shape
@@ -143,9 +144,10 @@ def _readme(detector: Detector, shape: Sequence[int], left_out: Sequence[str]) -
     """Return the text of the model card."""
     radar = "Power of radar tensors" if len(shape) == 4 else "Projections"
     config = detector.saved.config
-    if release := config.data.get("release"):
+    if release := config.data.release:
         radar = f"Projections of K-Radar's {release} files"
-    is_simulated = (config.get("simulation") or {}).get("scenes") == "procedural"
+    simulation = config.simulation
+    is_simulated = simulation is not None and simulation.scenes == "procedural"
     return _MODEL_CARD.read_text().format(
         name=type(detector.model).__name__,
         classes=", ".join(detector.classes),
@@ -183,8 +185,8 @@ def _exported(
     def of_batch(x: Any) -> jax.ShapeDtypeStruct:
         return _array(batch, *x.shape[1:], dtype=x.dtype)
 
-    image, camera = jax.tree.map(of_batch, no_images(1, model.image_size))
-    if not (with_backbone or model.vit is None):
+    image, camera = jax.tree.map(of_batch, no_images(1, model.options.image.size))
+    if model.options.image.kind == "vit" and not with_backbone:
         variables["params"].pop(IMAGE_BACKBONE, None)
         image = _array(batch, *model.feature_shape)
     return variables, (radar, image, vars(camera))
@@ -295,7 +297,9 @@ def _onnx_files(
     Raises:
         UserError: jax2onnx is not installed, or the image transformer is to be kept.
     """
-    if with_backbone and getattr(detector.model, "vit", None) is not None:
+    model = detector.saved.config.model
+    is_vit = isinstance(model, DinoRadeOptions) and model.image.kind == "vit"
+    if with_backbone and is_vit:
         raise UserError(
             "the image backbone cannot be exported to ONNX: drop --with-backbone and "
             "feed precomputed embeddings (docs/deploy.md)"
@@ -309,9 +313,9 @@ def _onnx_files(
 
     # With a fixed chunk size, the program does not choose by platform, which jax2onnx
     # cannot convert.
-    if detector.takes_camera:
-        config = detector.saved.config.copy_and_resolve_references()
-        config.model.fusion.chunk_size = config.model.fusion.chunk_size or CHUNK_SIZE
+    if isinstance(model, DinoRadeOptions):
+        size = model.fusion.chunk_size or CHUNK_SIZE
+        config = detector.saved.config.with_fields({"model.fusion.chunk_size": size})
         detector = Detector(dataclasses.replace(detector.saved, config=config))
     variables, shapes = _exported(detector, shape, batch_size, with_backbone)
     leaves, tree = jax.tree.flatten(shapes)

@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
-import flax.linen as nn
 import grain
 import jax
 import numpy as np
@@ -20,7 +19,7 @@ from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.pipeline import CameraInputs, LoaderOptions, make_loader, make_table
 from radejax.data.records import Records, embedding_fields
 from radejax.inference.detector import Detector
-from radejax.models.dinorade import IMAGE_BACKBONE
+from radejax.models.dinorade import IMAGE_BACKBONE, DinoRade
 from radejax.training import distributed
 from radejax.weights.image_backbone import weights_sha256
 
@@ -105,9 +104,8 @@ def predict_dataset(
 
 
 def embed_dataset(
-    model: nn.Module,
+    model: DinoRade,
     variables: Mapping[str, Any],
-    image_config: Mapping[str, Any],
     frames: Sequence[LabelledFrame],
     folder: str | os.PathLike,
     *,
@@ -120,8 +118,6 @@ def embed_dataset(
     Args:
         model: A `DinoRade` model.
         variables: Variables with the backbone's parameters in `params/image_backbone`.
-        image_config: The section `config.model.image`, which is stored with the
-            embeddings.
         frames: Frames of a dataset, normally of all splits.
         folder: Folder of the embeddings, created if missing.
         dtype: Dtype of the stored features: "float32", with which training gives the same
@@ -142,7 +138,7 @@ def embed_dataset(
     if not len(frames):
         raise UserError("no frames to embed")
     params = variables["params"][IMAGE_BACKBONE]
-    fields = embedding_fields(image_config)
+    fields = embedding_fields(model.options.image.to_dict())
     source = {"image": fields, "weights_sha256": weights_sha256(params)}
     records = Records.create(folder, model.feature_shape, dtype, source, "float32")
     keys = records.keys()
@@ -152,7 +148,10 @@ def embed_dataset(
     def read(frame: Any) -> UInt8[np.ndarray, "H W 3"]:
         size = frame.calibrated_size()
         return read_left_image(
-            frame.camera_path, model.image_size, resize=resize, calibrated_size=size
+            frame.camera_path,
+            model.options.image.size,
+            resize=resize,
+            calibrated_size=size,
         )
 
     embed = jax.jit(lambda params, image: model.apply(params, image, method="embed"))

@@ -14,29 +14,30 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import json
 import logging
 import pathlib
 from collections.abc import Mapping
 from typing import Any, Literal
 
-import flax.linen as nn
 import numpy as np
 import safetensors.numpy
 from flax import traverse_util
-from ml_collections import ConfigDict
 
 import radejax
 from radejax import models
+from radejax.config import Config
 from radejax.core import files
-from radejax.core.config import base_config, without_data_paths
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import PathLike
 from radejax.core.structures import CLASSES
 from radejax.data.cameras import CameraOptions
+from radejax.data.options import DataOptions
+from radejax.detection.decode import DecodeOptions
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.lifting import OFFICIAL_OFFSET_M
+from radejax.models.options import DinoRadeOptions, RadeNetOptions
+from radejax.models.radenet import RadeNet
 from radejax.training.checkpoints import Checkpoints
 from radejax.weights import dinorade_torch, image_backbone, radenet_torch
 from radejax.weights.convert import check_finite, read_state_dict
@@ -68,17 +69,16 @@ class SavedModel:
             checkpoint.
     """
 
-    config: ConfigDict
+    config: Config
     grid: RadarGrid
     variables: Mapping[str, Any]
     step: int | None = None
     run: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     @property
-    def model(self) -> nn.Module:
+    def model(self) -> RadeNet:
         """The Flax module, without parameters."""
-        # Runs of earlier versions have no `num_frames`.
-        return models.build(self.config.model, self.config.data.get("num_frames", 1))
+        return models.build(self.config.model, self.config.data.num_frames)
 
 
 def load_model(
@@ -137,21 +137,27 @@ def load_torch(
     """
     parts = radenet_torch.PART, dinorade_torch.PART
     tensors, source = read_state_dict(path_or_state_dict, *parts)
-    config = base_config()
-    config.data.azimuth_mapping = "stretched"
-    config.decode.threshold_inclusive = False
+    model: RadeNetOptions
+    camera: CameraOptions | None = None
     if any(name.startswith(dinorade_torch.PART) for name in tensors):
         model, variables = dinorade_torch.read(
             tensors, source, image_backbone, **model_overrides
         )
-        options = CameraOptions("pinhole", OFFICIAL_OFFSET_M, calibration="common")
-        config.data.camera = ConfigDict(dataclasses.asdict(options))
+        camera = CameraOptions(
+            projection="pinhole",
+            radar_from_lidar_m=OFFICIAL_OFFSET_M,
+            calibration="common",
+        )
     elif image_backbone is not None:
         raise UserError("image_backbone is given, but the model is RADE-Net")
     else:
         model, variables = radenet_torch.read(tensors, source, **model_overrides)
-    config.model = ConfigDict(model)
-    config.classes = CLASSES[: config.model.num_classes]
+    config = Config(
+        model=model,
+        classes=CLASSES[: model.num_classes],
+        data=DataOptions(azimuth_mapping="stretched", camera=camera),
+        decode=DecodeOptions(threshold_inclusive=False),
+    )
     return SavedModel(config, RadarGrid.kradar(), variables)
 
 
@@ -185,9 +191,10 @@ def save_model(
     """
     folder = files.as_path(folder)
     variables = {name: dict(tree) for name, tree in saved.variables.items()}
-    params, image = variables["params"], saved.config.model.get("image")
+    params, model = variables["params"], saved.config.model
+    image = model.image if isinstance(model, DinoRadeOptions) else None
     is_vit = image is not None and image.kind == "vit"
-    if is_vit and not with_backbone:
+    if image is not None and is_vit and not with_backbone:
         if IMAGE_BACKBONE in params and not image.freeze:
             raise UserError(
                 "the image backbone was fine-tuned, so its weights are required. If it "
@@ -207,7 +214,7 @@ def save_model(
     description = {
         "format": FORMAT,
         "radejax": radejax.__version__,
-        "config": without_data_paths(saved.config),
+        "config": saved.config.without_data_paths(),
         "grid": saved.grid.to_dict(),
         "left_out": [f"params/{IMAGE_BACKBONE}"] if is_incomplete else [],
         "sha256": {k: hashlib.sha256(v).hexdigest() for k, v in contents.items()},
@@ -231,13 +238,11 @@ def _read_exported(folder: pathlib.Path) -> SavedModel:
         arrays = safetensors.numpy.load(data)
         arrays = {name: value.astype(np.float32) for name, value in arrays.items()}
         variables = traverse_util.unflatten_dict(arrays, sep="/")
-        config = ConfigDict(content["config"], convert_dict=True)
+        config = Config(**content["config"])
         saved = SavedModel(config, RadarGrid.from_dict(content["grid"]), variables)
         image_backbone.check_fits(saved.model, variables, weights)
-        names, count = config.classes, config.model.num_classes
-        require(len(names) == count, "config.classes", names, f"{count} classes")
         return saved
-    # ConfigDict and the constructors raise these for a config that was edited by hand.
+    # These are raised for a file that was edited by hand.
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise DataError(f"{path}: {error}") from None
 
@@ -267,7 +272,7 @@ def _read_checkpoint(path: pathlib.Path, step: Step) -> SavedModel:
         state, info, number = checkpoints.restore_variables(chosen)
     params = state["ema_params"] if state.get("ema_params") else state["params"]
     return SavedModel(
-        ConfigDict(info["config"], convert_dict=True),
+        Config(**info["config"]),
         RadarGrid.from_dict(info["grid"]),
         {"params": params, **(state.get("model_state") or {})},
         number,
@@ -283,7 +288,8 @@ def _with_backbone(saved: SavedModel, given: PathLike | None) -> SavedModel:
     """
     params, data = saved.variables["params"], saved.config.data
     is_complete = IMAGE_BACKBONE in params
-    if "image" not in saved.config.model or (is_complete and given is None):
+    has_camera = isinstance(saved.config.model, DinoRadeOptions)
+    if not has_camera or (is_complete and given is None):
         return saved
     source, start = given or data.image_backbone, saved.run.get("init_from")
     part: Any = {"params": {}}
@@ -291,13 +297,14 @@ def _with_backbone(saved: SavedModel, given: PathLike | None) -> SavedModel:
         part = image_backbone.load_image_backbone(source, saved.model)
     elif start and files.as_path(start).exists() and not data.embeddings:
         source, part = start, _fitting_variables(start, saved.config.model)
+    if source is None:
+        return saved
     if IMAGE_BACKBONE not in part["params"]:
-        if source is not None:
-            _log.warning(
-                "image backbone weights not found at %s; the model accepts embedded "
-                "images only",
-                source,
-            )
+        _log.warning(
+            "image backbone weights not found at %s; the model accepts embedded images "
+            "only",
+            source,
+        )
         return saved
     backbone, sha256 = part["params"][IMAGE_BACKBONE], saved.run.get(FROZEN_BACKBONE)
     if sha256 is not None:
@@ -310,7 +317,7 @@ def _with_backbone(saved: SavedModel, given: PathLike | None) -> SavedModel:
 
 
 def starting_weights(
-    config: Any,
+    options: RadeNetOptions,
     init_from: PathLike | None = None,
     image_backbone_path: PathLike | None = None,
     embeddings_sha256: str | None = None,
@@ -318,7 +325,7 @@ def starting_weights(
     """Read the weights that a training starts from, including frozen ones.
 
     Args:
-        config: The section `config.model`.
+        options: The section `config.model`.
         init_from: Path of a model that `load_model` accepts; None initializes all weights
             randomly, except those of the image backbone.
         image_backbone_path: Weights of the image backbone, see
@@ -334,15 +341,15 @@ def starting_weights(
     Raises:
         UserError: The weights do not fit the model; the message names the differences.
     """
-    model: Any = models.build(config)
+    model: Any = models.build(options)
     variables = pretrained = digest = None
     if init_from is not None:
-        variables = _fitting_variables(init_from, config)
+        variables = _fitting_variables(init_from, options)
     if variables is None or IMAGE_BACKBONE not in variables["params"]:
         pretrained = image_backbone.load_image_backbone(
             image_backbone_path, model, embeddings_sha256
         )
-    if models.has_camera(model) and model.freeze:
+    if isinstance(options, DinoRadeOptions) and options.image.freeze:
         given: Any = variables if pretrained is None else pretrained
         digest = embeddings_sha256 or image_backbone.weights_sha256(
             given["params"][IMAGE_BACKBONE]
@@ -350,16 +357,17 @@ def starting_weights(
     return variables, pretrained, digest
 
 
-def _fitting_variables(path: PathLike, config: Any) -> Mapping[str, Any]:
+def _fitting_variables(path: PathLike, options: RadeNetOptions) -> Mapping[str, Any]:
     """Read the weights of another run or an official file, which must fit `config.model`."""
-    wanted = json.loads(config.to_json())
+    wanted = options.to_dict()
     if files.as_path(path).is_dir():
         other = load_model(path)
-        found = json.loads(other.config.model.to_json())
+        found = other.config.model.to_dict()
         if lines := files.differences(found, wanted, "config.model"):
             raise UserError(f"weights of {path} do not fit: {'; '.join(lines)}")
         return other.variables
-    structure = {name: value for name, value in wanted.items() if name != "name"}
-    variables = load_torch(path, **({} if "image" in config else structure)).variables
-    image_backbone.check_fits(models.build(config), variables, path)
+    has_camera = isinstance(options, DinoRadeOptions)
+    structure = {} if has_camera else {n: x for n, x in wanted.items() if n != "name"}
+    variables = load_torch(path, **structure).variables
+    image_backbone.check_fits(models.build(options), variables, path)
     return variables

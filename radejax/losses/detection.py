@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
-import math
 from collections.abc import Callable, Mapping
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import pydantic
 from jaxtyping import Bool, Float, Int, Num
 
-from radejax.core.config import find_part
-from radejax.core.errors import POSITIVE, Range, check_options, one_of
+from radejax.core.errors import require
+from radejax.core.options import NotNegative, Options, Positive, find_part
 from radejax.core.structures import Batch, DetectionMaps
 from radejax.detection.decode import DecodeOptions, find_peaks, suppress
 from radejax.detection.nms import match_boxes
@@ -30,70 +29,48 @@ _MAX_PEAKS = 128
 """Maximum number of peaks that enter NMS for the assignment "nms"."""
 
 
-@dataclasses.dataclass(frozen=True)
-class LossOptions:
-    """Options of `detection_loss`, which are the fields of `config.loss` and `decoding`.
-
-    Attributes:
-        heatmap_sigma_mode: Shape of the target Gaussians, see `gaussian_heatmap`.
-        heatmap_sigma_bins: Standard deviation of the target Gaussians in bins, for "fixed".
-        gwd_transform: Transform of the distance, see `gwd_loss`; "sqrt" in the paper,
-            "none" in the released code.
-        gwd_tau: Offset of the transformed distance, see `gwd_loss`.
-        normalize_yaw: Whether to normalize the predicted yaw vector for the GWD. The
-            released code does not. Smooth L1 always uses the raw vector, so that the
-            network learns to predict unit length.
-        assignment: "center" compares each object with the prediction at its own bin, as in
-            the released code. "nms" compares predictions that survive NMS with the object
-            that they overlap most, as in the paper.
-        own_terms: Losses besides `LOSSES`, each as "module:function".
-        weights: Weights of the losses by their name in `LOSSES`, or by the name of a
-            function of `own_terms`. A loss without a weight is not computed.
-        normalize: Whether to divide each loss by its own value, without a gradient through
-            the divisor. Each loss that is not 0 then contributes its weight to the total,
-            whatever its value.
-        decoding: Thresholds of peaks and NMS for the assignment "nms", which should be
-            those of inference.
-
-    Raises:
-        UserError: A value is out of range.
-    """
+class LossOptions(Options, section="config.loss"):
+    """Options of `detection_loss`."""
 
     heatmap_sigma_mode: SigmaMode = "fixed"
-    heatmap_sigma_bins: float = 3.0
+    """Standard deviation of the Gaussian heatmap targets: fixed, adaptive (depends on
+    the size of the box), anisotropic (depends on its length and width)."""
+    heatmap_sigma_bins: Positive = 3.0
+    """Standard deviation in the mode fixed, in bins."""
     gwd_transform: Transform = "sqrt"
-    gwd_tau: float = 1.65
+    """Transform of the Wasserstein distance: sqrt (paper), none (released code), log1p."""
+    gwd_tau: Positive = 1.65
+    """Loss of a distance d: 1 - 1 / (tau + transform(d))."""
     normalize_yaw: bool = False
+    """Normalize the predicted yaw vector before the Wasserstein distance. The released code
+    does not. Smooth L1 always uses the raw vector, so that the network learns to predict
+    unit length."""
     assignment: Assignment = "center"
+    """Boxes of the regression losses: center (predictions at the objects' own bins, as
+    released) or nms (predictions that overlap an object after NMS, with the thresholds of
+    decode, as in the paper)."""
     own_terms: tuple[str, ...] = ()
-    weights: Mapping[str, float] = dataclasses.field(
-        default_factory=lambda: {"focal": 2.0, "gwd": 1.0, "smooth_l1": 1.0}
+    """Other loss terms, each module:function."""
+    weights: dict[str, NotNegative] = pydantic.Field(
+        default={"focal": 2.0, "gwd": 1.0, "smooth_l1": 1.0}
     )
+    """Weight of every loss term: focal, gwd, smooth_l1 and the functions of `own_terms` by
+    name. A loss without a weight is not computed."""
     normalize: bool = True
-    decoding: DecodeOptions = DecodeOptions()  # noqa: RUF009, immutable
+    """Divide each term by its own value, without a gradient through the divisor. The
+    value of the loss is then the sum of the weights."""
 
-    def __post_init__(self) -> None:
-        terms = self.terms
-        own = terms.keys() - LOSSES.keys()
-
-        def are_weights(weights: Mapping[str, float]) -> bool:
-            are_numbers = all(0 <= weight < math.inf for weight in weights.values())
-            is_complete = own <= set(weights) <= set(terms)
-            return is_complete and are_numbers and any(weights.values())
-
-        ranges: dict[str, Range] = {
-            "heatmap_sigma_mode": one_of(*get_args(SigmaMode)),
-            "heatmap_sigma_bins": POSITIVE,
-            "gwd_transform": one_of(*get_args(Transform)),
-            "gwd_tau": POSITIVE,
-            "assignment": one_of(*get_args(Assignment)),
-            "weights": (
-                are_weights,
-                f"numbers of at least 0, not all 0, for some of {', '.join(terms)}, and "
-                "for all of own_terms",
-            ),
-        }
-        check_options(vars(self), "config.loss", ranges)
+    @pydantic.model_validator(mode="after")
+    def _check(self) -> LossOptions:
+        terms, names = self.terms, set(self.weights)
+        is_complete = terms.keys() - LOSSES.keys() <= names <= terms.keys()
+        expected = (
+            f"numbers of at least 0, not all 0, for some of {', '.join(terms)}, and for "
+            "all of own_terms"
+        )
+        is_fine = is_complete and any(self.weights.values())
+        require(is_fine, "config.loss.weights", self.weights, expected)
+        return self
 
     @property
     def terms(self) -> dict[str, Callable[..., Float[jax.Array, ""]]]:
@@ -106,7 +83,11 @@ class LossOptions:
 
 
 def detection_loss(
-    maps: DetectionMaps, batch: Batch, grid: RadarGrid, **options: Any
+    maps: DetectionMaps,
+    batch: Batch,
+    grid: RadarGrid,
+    options: LossOptions | None = None,
+    decoding: DecodeOptions | None = None,
 ) -> tuple[Float[jax.Array, ""], dict[str, Scalar]]:
     """Computes the weighted sum of the losses in `weights`, and its terms, in float32.
 
@@ -117,14 +98,15 @@ def detection_loss(
         maps: Predictions, `[B, R, A, C]` logits and `[B, R, A, 8]` box parameters.
         batch: Ground truth, of which `boxes`, `classes` and `is_valid` are used.
         grid: The grid of the maps, padded if they are.
-        **options: Fields of `LossOptions`.
+        options: Options of the loss; the defaults are those of the paper's loss.
+        decoding: Thresholds of peaks and NMS for the assignment "nms", which should be
+            those of inference.
 
     Returns:
         Scalar total, and a dictionary of scalars: the raw losses, their `weighted_sum`,
         `num_objects`, `num_positive` (bins) and `num_matched` (boxes).
 
     Raises:
-        UserError: An option is out of range.
         ValueError: The shapes of maps, batch and grid do not match.
 
     References:
@@ -138,7 +120,7 @@ def detection_loss(
         >>> float(loss(maps, batch, RadarGrid.kradar())[0])
         4.0
     """
-    chosen = LossOptions(**options)
+    options = options or LossOptions()
     grid.check_maps(maps.heatmap_logits, maps.box_params)
     shape = batch.boxes.shape
     if len(shape) != 3 or shape[0] != len(maps.heatmap_logits) or shape[2] != 8:
@@ -155,16 +137,18 @@ def detection_loss(
         is_valid,
         grid,
         num_classes=maps.heatmap_logits.shape[-1],
-        sigma_mode=chosen.heatmap_sigma_mode,
-        sigma_bins=chosen.heatmap_sigma_bins,
+        sigma_mode=options.heatmap_sigma_mode,
+        sigma_bins=options.heatmap_sigma_bins,
     )
     # The bins of the predictions that are compared, their objects, and a mask of those
     # that have one.
-    if chosen.assignment == "center":
+    if options.assignment == "center":
         bins = grid.nearest_bin(boxes[..., 0], boxes[..., 1])  # [B, N, 2]
         expected, is_matched = boxes, is_valid
     else:
-        bins, expected, is_matched = _after_nms(chosen, maps, boxes, is_valid, grid)
+        bins, expected, is_matched = _after_nms(
+            decoding or DecodeOptions(), maps, boxes, is_valid, grid
+        )
     # A gather per frame needs no communication if the batch is sharded over devices.
     gather = jax.vmap(lambda params, bins: params[bins[:, 0], bins[:, 1]])
     predicted = grid.boxes_at(gather(maps.box_params, bins), bins)
@@ -178,10 +162,10 @@ def detection_loss(
         jnp.where(row, expected, 1.0),
         is_matched,
     )
-    functions = chosen.terms
-    terms = {name: functions[name](pairs, chosen) for name in chosen.weights}
-    total = _weighted_sum(terms, chosen.weights, chosen.normalize)
-    terms["weighted_sum"] = _weighted_sum(terms, chosen.weights, False)
+    functions = options.terms
+    terms = {name: functions[name](pairs, options) for name in options.weights}
+    total = _weighted_sum(terms, options.weights, options.normalize)
+    terms["weighted_sum"] = _weighted_sum(terms, options.weights, False)
     counted = {"objects": is_valid, "positive": target >= 1, "matched": is_matched}
     terms |= {f"num_{k}": jnp.sum(of, dtype=jnp.int32) for k, of in counted.items()}
     return total, terms
@@ -278,7 +262,7 @@ def _weighted_sum(
 
 
 def _after_nms(
-    options: LossOptions,
+    decoding: DecodeOptions,
     maps: DetectionMaps,
     boxes: Boxes8,
     is_valid: Mask,
@@ -289,7 +273,6 @@ def _after_nms(
     Returns:
         Bins of K peaks, their objects, and a mask of the peaks that have one.
     """
-    decoding = options.decoding
     # The selection of boxes is not differentiable.
     peaks = find_peaks(
         jax.lax.stop_gradient(maps),

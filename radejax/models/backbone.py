@@ -18,7 +18,7 @@ from jaxtyping import Float
 from radejax.models import layers
 from radejax.models.layers import ConvGNSiLU, Features, Map
 
-CBAMKind = Literal["official", "paper"]
+CBAMKind = Literal["official", "paper", "off"]
 
 REDUCTION = 16
 """Channels per hidden unit of the channel attention's network."""
@@ -135,14 +135,14 @@ class Backbone(layers.Part):
         doppler_bins: Number of Doppler channels of the input, used by `InputStem` only.
         widths: Channels of the encoder levels, finest first.
         decoder_width: Channels of the last decoder stage.
-        cbam: Kind of the `CBAM` in the skip connections; None for skips without attention.
+        cbam: Kind of the `CBAM` in the skip connections; "off" for skips without attention.
         input_stem: Whether to use `InputStem` instead of one 3x3 convolution.
     """
 
     doppler_bins: int
     widths: tuple[int, ...] = (128, 256, 512)
     decoder_width: int = 128
-    cbam: CBAMKind | None = "official"
+    cbam: CBAMKind = "official"
     input_stem: bool = False
 
     @nn.compact
@@ -166,7 +166,7 @@ class Backbone(layers.Part):
         for i, width in enumerate(decoder_widths, 1):
             skip = skips.pop()
             x = layers.Upsample(x.shape[-1], dtype=self.dtype, name=f"upsample_{i}")(x)
-            if self.cbam is not None:
+            if self.cbam != "off":
                 skip = wrap(CBAM)(self.cbam, **shared, name=f"cbam_{i}")(skip)
             x = block(width, name=f"decoder_{i}")(jnp.concatenate([x, skip], -1))
         return x

@@ -7,70 +7,30 @@ References:
 
 from __future__ import annotations
 
-from typing import Literal, get_args
-
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Float, Real
 
-from radejax.core.errors import BELOW_ONE, SIZE, check_options, integer, one_of
 from radejax.core.structures import Array
 from radejax.models import lifting
 from radejax.models.deformable_attention import DeformableAttention
 from radejax.models.heads import DilatedNeck
 from radejax.models.layers import Dense, Map, Part
-from radejax.models.lifting import OutOfViewRule, ReferencePoints, WeightingKind
-
-GateKind = Literal["channel", "bin"]
+from radejax.models.lifting import ReferencePoints
+from radejax.models.options import FusionOptions
 
 
 class Fusion(Part):
     """Weighted lifting, deformable attention to the camera map, and gated sum with the radar.
 
     Attributes:
-        num_heads: Number of attention heads.
-        num_points: Samples per head and query.
-        num_elevation: Number E of elevation segments.
-        weighting: Network for the elevation weights, "mlp" (paper), "cnn" (released code)
-            or "off"; see `WeightingNetwork`.
-        gate: "channel" predicts a weight of the radar for every channel of a bin, as in
-            the paper. "bin" predicts one weight of the camera per bin, as in the released
-            code.
-        out_of_view: Treatment of queries outside the image. "drop" excludes them from the
-            mean over a bin's queries, and a bin without valid queries keeps its radar
-            feature. "official" sets them to zero, but they still sample the image border
-            and enter the mean.
-        necks: Whether to apply a dilated neck to each map before the attention. The
-            released settings have these necks, and the paper's 31 M parameters include
-            them.
-        dropout: Dropout rate of the fused map.
+        options: Options of the fusion.
         num_groups: Groups of the necks' normalizations.
-        chunk_size: Bins per chunk of the attention; 0 selects a default for the platform.
         remat: Recompute the necks in the backward pass instead of storing their blocks.
     """
 
-    num_heads: int = 4
-    num_points: int = 4
-    num_elevation: int = 10
-    weighting: WeightingKind = "mlp"
-    gate: GateKind = "channel"
-    out_of_view: OutOfViewRule = "drop"
-    necks: bool = True
-    dropout: float = 0.1
-    chunk_size: int = 0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        ranges = {
-            **dict.fromkeys(("num_heads", "num_points", "num_elevation"), SIZE),
-            "chunk_size": integer(0, 1 << 16),
-            "weighting": one_of(*get_args(WeightingKind)),
-            "gate": one_of(*get_args(GateKind)),
-            "out_of_view": one_of(*get_args(OutOfViewRule)),
-            "dropout": BELOW_ONE,
-        }
-        check_options(vars(self), "config.model.fusion", ranges)
+    options: FusionOptions = FusionOptions()
 
     @nn.compact
     def __call__(
@@ -99,23 +59,26 @@ class Fusion(Part):
             `[B, R, A, C]` fused map.
         """
         b, r, a, c = radar.shape
-        if self.necks:
+        options = self.options
+        if options.necks:
             radar = self._neck("radar_neck")(radar)
-        dropout = nn.Dropout(self.dropout, deterministic=not train)
+        dropout = nn.Dropout(options.dropout, deterministic=not train)
         if camera is None or reference is None:
             return dropout(radar)
-        if self.necks:
+        if options.necks:
             camera = self._neck("camera_neck")(camera)
         weights = lifting.WeightingNetwork(
-            self.num_elevation, self.weighting, dtype=self.dtype, name="weighting"
+            options.num_elevation, options.weighting, dtype=self.dtype, name="weighting"
         )(elevation)  # [B, R, A, E]
         scale = weights * reference.is_valid
-        mean = lifting.query_weights(jnp.asarray(reference.is_valid), self.out_of_view)
+        mean = lifting.query_weights(
+            jnp.asarray(reference.is_valid), options.out_of_view
+        )
 
         def per_bin(x: Real[Array, "_ R A ..."]) -> Real[jax.Array, "_ bins ..."]:
             return jnp.asarray(x).reshape(x.shape[0], r * a, *x.shape[3:])
 
-        counts = self.num_heads, self.num_points, self.chunk_size
+        counts = options.num_heads, options.num_points, options.chunk_size
         attention = DeformableAttention(c, *counts, dtype=self.dtype, name="attention")
         points, means = per_bin(reference.points), per_bin(mean)
         seen = attention(per_bin(radar), per_bin(scale), points, means, camera)
@@ -137,7 +100,7 @@ class Fusion(Part):
         """Returns the weight of the camera per bin, for every channel or for all together."""
         c = radar.shape[-1]
         x = jnp.concatenate([radar, seen], -1)
-        if self.gate == "bin":
+        if self.options.gate == "bin":
             x = nn.relu(Dense(c // 2, dtype=self.dtype, name="gate_hidden")(x))
             return nn.sigmoid(Dense(1, dtype=self.dtype, name="gate_out")(x))
         x = nn.relu(Dense(c, dtype=self.dtype, name="gate_hidden")(x))

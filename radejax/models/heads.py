@@ -17,7 +17,7 @@ from collections.abc import Sequence
 
 import flax.linen as nn
 
-from radejax.core.config import find_part
+from radejax.core.options import find_part
 from radejax.core.structures import DetectionMaps
 from radejax.models import layers
 from radejax.models.layers import ConvGNSiLU, Features, Map

@@ -12,7 +12,7 @@ References:
 from __future__ import annotations
 
 import functools
-from typing import Any, Literal, get_args
+from typing import Any
 
 import chex
 import flax.linen as nn
@@ -21,10 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from radejax.core.errors import SIZE, check_options, integer, one_of, require
 from radejax.models.layers import Layer
-
-AttentionKind = Literal["auto", "blocked", "xla", "cudnn"]
+from radejax.models.options import AttentionKind, ViTOptions
 
 Tokens = Float[jax.Array, "B T C"]
 PerHead = Float[jax.Array, "B T heads D"]
@@ -42,74 +40,31 @@ class ViT(Layer):
     The tokens are the class token, the registers and the patches in row-major order, after
     the final normalization. An image whose height or width is not a multiple of the patch
     size is first resized to the nearest multiples, with linear interpolation and
-    antialiasing; see `grid`.
+    antialiasing; see `ViTOptions.grid`.
 
     Attributes:
-        hidden_size: Channels C of the tokens, a multiple of 4 times `num_heads`.
-        num_layers: Number of transformer blocks.
-        num_heads: Number of attention heads.
-        mlp_dim: Hidden channels of each block's MLP.
-        patch_size: Height and width of a patch in pixels.
-        num_registers: Number of learned tokens in addition to the class token.
-        gated_mlp: Whether to use a SwiGLU MLP, as in the larger DINOv3 models, instead of
-            a GELU MLP.
-        layer_scale: Initial value of the learned scales of the residual branches.
-        position_grid: Patches along each axis of DINOv2's learned position embedding,
-            which is interpolated to the patches of the image; 0 for DINOv3's rotary
-            embedding. The epsilon of the normalizations is that of the same model.
-        attention: Implementation of the attention, see `attend`.
+        options: Options of the transformer, whose `hidden_size` is C.
         dtype: Dtype of the computation; normalization statistics and the returned tokens
             are float32.
         remat: Recompute blocks in the backward pass instead of storing them.
     """
 
-    hidden_size: int = 384
-    num_layers: int = 12
-    num_heads: int = 6
-    mlp_dim: int = 1536
-    patch_size: int = 16
-    num_registers: int = 4
-    gated_mlp: bool = False
-    layer_scale: float = 1.0
-    position_grid: int = 0
-    attention: AttentionKind = "auto"
+    options: ViTOptions = ViTOptions()
     remat: bool = False
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        sizes = ("hidden_size", "num_layers", "num_heads", "mlp_dim", "patch_size")
-        ranges = dict.fromkeys(sizes, SIZE) | {
-            "num_registers": integer(0, 1 << 16),
-            "position_grid": integer(0, 1 << 10),
-            "attention": one_of(*get_args(AttentionKind)),
-        }
-        check_options(vars(self), "config.model.image", ranges)
-        size, name = self.hidden_size, "config.model.image.hidden_size"
-        expected = f"a multiple of 4 channels for each of {self.num_heads} heads"
-        require(size % (4 * self.num_heads) == 0, name, size, expected)
-
-    @property
-    def num_prefix(self) -> int:
-        """Number of tokens before the first patch."""
-        return 1 + self.num_registers
-
-    def grid(self, height: int, width: int) -> tuple[int, int]:
-        """Returns the rows and columns of patches of an image, rounded half up."""
-        size = self.patch_size
-        return (height + size // 2) // size, (width + size // 2) // size
 
     @nn.compact
     def __call__(
         self, image: Float[jax.Array, "B H W 3"]
-    ) -> Float[jax.Array, "B T {self.hidden_size}"]:
+    ) -> Float[jax.Array, "B T {self.options.hidden_size}"]:
         """Computes float32 tokens of normalized float images `[B, H, W, 3]`."""
         chex.assert_shape(image, (None, None, None, 3))
-        rows, columns = self.grid(*image.shape[1:3])
-        size = (rows * self.patch_size, columns * self.patch_size)
+        options = self.options
+        rows, columns = options.grid(*image.shape[1:3])
+        size = (rows * options.patch_size, columns * options.patch_size)
         image = jax.image.resize(image, (image.shape[0], *size, 3), "linear")
         tokens = self._embed(image, rows, columns)
-        head_dim = self.hidden_size // self.num_heads
-        rope = None if self.position_grid else rotary_angles(rows, columns, head_dim)
+        head_dim = options.hidden_size // options.num_heads
+        rope = None if options.position_grid else rotary_angles(rows, columns, head_dim)
         block = nn.remat(Block, prevent_cse=False) if self.remat else Block
         # One block is traced for all layers; its parameters have a leading layer axis.
         layers = nn.scan(
@@ -117,15 +72,10 @@ class ViT(Layer):
             variable_axes={"params": 0},
             split_rngs={"params": True},
             in_axes=nn.broadcast,
-            length=self.num_layers,
+            length=options.num_layers,
         )
         tokens, _ = layers(
-            self.num_heads,
-            self.mlp_dim,
-            self.num_prefix,
-            self.gated_mlp,
-            self.layer_scale,
-            self.attention,
+            options,
             self.dtype,
             name="layers",
         )(tokens, rope)
@@ -133,24 +83,25 @@ class ViT(Layer):
 
     def _embed(
         self, image: Float[jax.Array, "B H W 3"], rows: int, columns: int
-    ) -> Float[jax.Array, "B T {self.hidden_size}"]:
+    ) -> Float[jax.Array, "B T {self.options.hidden_size}"]:
         """Embeds patches by a linear layer and prepends the learned tokens."""
-        b, size = image.shape[0], self.patch_size
+        options = self.options
+        b, size = image.shape[0], options.patch_size
         # As patches do not overlap, the convolution is a product with flattened patches.
         patches = image.reshape(b, rows, size, columns, size, 3)
         patches = patches.transpose(0, 1, 3, 2, 4, 5).reshape(b, rows * columns, -1)
         patches = nn.Dense(
-            self.hidden_size, kernel_init=_INIT, dtype=self.dtype, name="patch_embed"
+            options.hidden_size, kernel_init=_INIT, dtype=self.dtype, name="patch_embed"
         )(patches)
-        shape = (1, self.num_prefix, self.hidden_size)
+        shape = (1, options.num_prefix, options.hidden_size)
         prefix = self.param("prefix_tokens", _INIT, shape)
-        if n := self.position_grid:
+        if n := options.position_grid:
             # Positions of the class token and of the patches.
-            shape = (1, 1 + n * n, self.hidden_size)
+            shape = (1, 1 + n * n, options.hidden_size)
             position = self.param("position_embedding", _INIT, shape)
             prefix = prefix.at[:, :1].add(position[:, :1])
             # transformers resamples with antialiasing only in models with registers.
-            smooth = self.num_registers > 0
+            smooth = options.num_registers > 0
             axes = [bicubic_weights(n, m, antialias=smooth) for m in (rows, columns)]
             grid = position[0, 1:].reshape(n, n, -1)
             grid = jnp.einsum("rn,cm,nmd->rcd", *axes, grid, precision="highest")
@@ -162,12 +113,7 @@ class ViT(Layer):
 class Block(nn.Module):
     """Transformer block with scaled residual branches; its attributes are those of `ViT`."""
 
-    num_heads: int
-    mlp_dim: int
-    num_prefix: int
-    gated_mlp: bool
-    layer_scale: float
-    attention: AttentionKind
+    options: ViTOptions
     dtype: Any
 
     @nn.compact
@@ -182,21 +128,21 @@ class Block(nn.Module):
         b, t, c = x.shape
         # DINOv3 has no bias of the key, and DINOv2's does not change the result: without
         # rotation it adds the same to all scores of a query.
-        shape = b, t, self.num_heads, -1
+        shape = b, t, self.options.num_heads, -1
         query, key, value = (
             self._dense(c, name, use_bias=name != "key")(x).reshape(shape)
             for name in ("query", "key", "value")
         )  # [B, T, heads, C / heads]
         if rope is not None:
-            query = rotate(query, rope, self.num_prefix)
-            key = rotate(key, rope, self.num_prefix)
-        y = attend(query, key, value, self.attention).reshape(b, t, c)
+            query = rotate(query, rope, self.options.num_prefix)
+            key = rotate(key, rope, self.options.num_prefix)
+        y = attend(query, key, value, self.options.attention).reshape(b, t, c)
         return self._dense(c, "out")(y)
 
     def _mlp(self, x: Tokens) -> Tokens:
-        y = self._dense(self.mlp_dim, "up")(x)
-        if self.gated_mlp:
-            y = nn.silu(self._dense(self.mlp_dim, "gate")(x)) * y
+        y = self._dense(self.options.mlp_dim, "up")(x)
+        if self.options.gated_mlp:
+            y = nn.silu(self._dense(self.options.mlp_dim, "gate")(x)) * y
         else:
             y = nn.gelu(y, approximate=False)
         return self._dense(x.shape[-1], "down")(y)
@@ -205,7 +151,7 @@ class Block(nn.Module):
         return nn.Dense(features, use_bias, self.dtype, kernel_init=_INIT, name=name)
 
     def _scale(self, name: str, x: Tokens) -> Float[jax.Array, "1 1 C"]:
-        init = nn.initializers.constant(self.layer_scale)
+        init = nn.initializers.constant(self.options.layer_scale)
         scale = self.param(name, init, (x.shape[-1],)).astype(self.dtype)
         return scale[None, None]
 

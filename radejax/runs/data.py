@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-import json
 import logging
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -14,10 +13,8 @@ import flax.linen as nn
 import grain
 import jax
 import numpy as np
-from ml_collections import ConfigDict
 
-from radejax import models
-from radejax.core.config import DATA_PATHS
+from radejax.config import Config, check_bins
 from radejax.core.errors import UserError, require
 from radejax.core.files import as_path
 from radejax.core.structures import Batch
@@ -26,12 +23,15 @@ from radejax.data.augment import Augmentation
 from radejax.data.cameras import CameraOptions
 from radejax.data.dataset import FrameSequence, LabelledFrames, data_set
 from radejax.data.kradar.dataset import held_out
+from radejax.data.options import DATA_PATHS
 from radejax.data.projection import decode
 from radejax.data.records import Records
 from radejax.inference.saved import SavedModel
-from radejax.runs.checks import check_bins
+from radejax.models.options import DinoRadeOptions, RadeNetOptions
+from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
 from radejax.training import distributed
+from radejax.training.options import TrainOptions
 
 _log = logging.getLogger(__name__)
 
@@ -62,25 +62,26 @@ class Data:
         FileNotFoundError: A folder is missing.
     """
 
-    def __init__(self, config: ConfigDict, model: Any) -> None:
+    def __init__(self, config: Config, model: Any) -> None:
         options = self.options = config.data
+        assert options.records is not None  # `located` fills it in
+        self._records_folder = options.records
         self.classes = tuple(config.classes)
         self.camera: CameraOptions | None = None
         self.features: Records | None = None
         self._model, self._skipped = model, set[str]()
         self._splits: dict[str, LabelledFrames] = {}
-        if models.has_camera(model):
-            self.camera = CameraOptions.from_config(options)
+        image = None
+        if isinstance(config.model, DinoRadeOptions):
+            self.camera, image = options.used_camera, config.model.image
         if options.embeddings is not None:
-            is_frozen = self.camera is not None and model.freeze
-            if not is_frozen or options.mirror_probability:
+            if image is None or not image.freeze or options.mirror_probability:
                 raise UserError(
                     "embeddings are given: they need a model whose image backbone is frozen "
                     "(config.model.image.freeze=True) and, as they cannot be mirrored, "
                     "config.data.mirror_probability=0"
                 )
-            image_config = config.model.image
-            self.features = records.open_embeddings(options.embeddings, image_config)
+            self.features = records.open_embeddings(options.embeddings, image.to_dict())
         is_common = self.camera is not None and self.camera.calibration == "common"
         self.frames = data_set(options.format)(
             options.roots,
@@ -95,7 +96,7 @@ class Data:
             weather=options.weather or None,
         )
         name = f"radar data in {', '.join(options.roots)}"
-        reduced.check_release(self.frames.release, options.get("release"), name)
+        reduced.check_release(self.frames.release, options.release, name)
         if self.frames.release is not None and not config.model.doppler_bins:
             self.frames.grid = self.frames.grid.without_doppler()
         if options.format != "kradar":  # the reader of K-Radar checks its labels itself
@@ -111,7 +112,7 @@ class Data:
                 or no space is left on the disk.
         """
         report = distributed.main_only(
-            lambda: records.preprocess(self._chosen(self.frames), self.options.records)
+            lambda: records.preprocess(self._chosen(self.frames), self._records_folder)
         )
         if report is not None and report.skipped:
             _log.warning("%s", report.to_text())
@@ -122,7 +123,7 @@ class Data:
     @functools.cached_property
     def records(self) -> Records:
         """Projections of the frames, on their grid."""
-        return records.open_projections(self.options.records, self.frames.grid)
+        return records.open_projections(self._records_folder, self.frames.grid)
 
     def split(self, name: str, *, may_be_empty: bool = False) -> LabelledFrames:
         """Return the frames of a split.
@@ -197,11 +198,11 @@ class Data:
         """
         if self.camera is None:
             return None
-        size = tuple(self._model.image_size)
+        size = self._model.options.image.size
         return pipeline.camera_inputs(frames, size, self.camera, self.features)
 
     def training_batches(
-        self, frames: FrameSequence, train: ConfigDict, seed: int
+        self, frames: FrameSequence, train: TrainOptions, seed: int
     ) -> grain.DatasetIterator[Batch]:
         """Return an endless, shuffled, checkpointable iterator over this process's batches.
 
@@ -238,7 +239,7 @@ class Data:
         return pipeline.make_loader(table, loader, augment=augment)
 
 
-def located(config: ConfigDict) -> ConfigDict:
+def located(config: Config) -> Config:
     """Return a copy of a config with absolute paths in `config.data`.
 
     By default, the roots are the folder of the simulated dataset, and the records are
@@ -250,22 +251,20 @@ def located(config: ConfigDict) -> ConfigDict:
         FileNotFoundError: A path of `config.data` does not exist. The records and
             simulated data may be missing, because a run creates them.
     """
-    config = config.copy_and_resolve_references()
-    options, is_simulated = config.data, "simulation" in config
-    roots = options.roots
-    if is_simulated:
-        name, one = "config.data.roots", "one folder, as the config simulates it"
-        require(len(roots) <= 1, name, tuple(roots), one)
+    options, roots = config.data, config.data.roots
+    if config.simulation is not None:
+        one = "one folder, as the config simulates it"
+        require(len(roots) <= 1, "config.data.roots", roots, one)
         roots = roots or (_simulated_root(config.simulation),)
+    else:
+        _check_exist(roots)
     if not roots:
         raise UserError(
             "no data: give --data ROOT[,ROOT...] with K-Radar's sequence folders, or a "
             "config that simulates them, such as quickstart"
         )
-    _set_paths(config, roots)
-    _check_exist(() if is_simulated else options.roots)
     _check_exist((options.labels, options.embeddings, options.image_backbone))
-    return config
+    return _with_paths(config, roots)
 
 
 def _check_exist(paths: Iterable[str | None]) -> None:
@@ -274,40 +273,38 @@ def _check_exist(paths: Iterable[str | None]) -> None:
             raise FileNotFoundError(f"no such file or folder: {path}")
 
 
-def _simulated_root(simulation: ConfigDict) -> str:
+def _simulated_root(simulation: SimulationOptions) -> str:
     """Return the folder of a simulated dataset, whose name contains a hash of its config."""
-    text = json.dumps(json.loads(simulation.to_json()), sort_keys=True)
-    return f"data/simulated-{hashlib.sha256(text.encode()).hexdigest()[:8]}"
+    digest = hashlib.sha256(simulation.to_json().encode()).hexdigest()
+    return f"data/simulated-{digest[:8]}"
 
 
-def _set_paths(config: ConfigDict, roots: Iterable[str]) -> None:
-    """Make paths of `config.data` absolute; records are in the first root by default.
+def _with_paths(config: Config, roots: Iterable[str]) -> Config:
+    """Return a config with absolute data paths; records are in the first root by default.
 
     Those without Doppler have a folder of their own.
     """
-    options = config.data
+    _check_exist([config.data.camera_calibration])
     folder = "records" if config.model.doppler_bins else "records_without_doppler"
     roots = tuple(str(as_path(root).absolute()) for root in roots)
-    paths = {name: options[name] for name in DATA_PATHS if name != "roots"}
+    paths = {n: getattr(config.data, n) for n in DATA_PATHS if n != "roots"}
     paths["records"] = paths["records"] or as_path(roots[0]) / folder
     absolute = {n: x and str(as_path(x).absolute()) for n, x in paths.items()}
-    with options.ignore_type():  # a checkpoint's config has lists instead of tuples
-        options.update(absolute, roots=roots)
-    _check_exist([options.camera_calibration])
+    return config.replace(data=absolute | {"roots": roots})
 
 
-def simulate_missing(config: ConfigDict) -> None:
+def simulate_missing(config: Config) -> None:
     """Simulate the dataset of a config if it has a `simulation` section.
 
     Args:
         config: Config of the run with absolute paths, see `located`.
     """
-    if "simulation" in config:
-        values, root = dict(config.simulation), config.data.roots[0]
-        distributed.main_only(lambda: simulate_dataset(values, root))
+    simulation, root = config.simulation, config.data.roots[0]
+    if simulation is not None:
+        distributed.main_only(lambda: simulate_dataset(simulation, root))
 
 
-def open_data(config: ConfigDict, model: nn.Module) -> Data:
+def open_data(config: Config, model: nn.Module) -> Data:
     """Simulate the data if the config requires it, write missing records, and open all.
 
     With several processes, the main process writes the files before the others read them.
@@ -355,16 +352,16 @@ def open_data(config: ConfigDict, model: nn.Module) -> Data:
     return data
 
 
-def _log_input(data: Data, model: ConfigDict) -> None:
+def _log_input(data: Data, model: RadeNetOptions) -> None:
     """Log mean and standard deviation of the input; warn if it is nearly constant."""
     frames = list(data.split("train"))
     some = frames[:: -(-len(frames) // _INPUT_FRAMES)]
     values = np.stack([decode(data.records[frame.key]) for frame in some])
     mean, spread = float(values.mean()), float(values.std())
     _log.info("input: %.3f ± %.3f in %d frames to train on", mean, spread, len(some))
-    center, scale = model.get("input_center", 0.0), model.get("input_scale", 1.0)
-    is_unusual = abs(scale * (mean - center) - _KRADAR_INPUT) > 0.1
-    if is_unusual and abs(scale) * spread < 0.05:
+    seen = model.input_scale * (mean - model.input_center)
+    is_unusual = abs(seen - _KRADAR_INPUT) > 0.1
+    if is_unusual and model.input_scale * spread < 0.05:
         _log.warning(
             "the network sees a nearly constant input, other than that of K-Radar "
             "(%.3f): set --config.model.input_center=%.3f --config.model.input_scale=%.3g",
@@ -374,7 +371,7 @@ def _log_input(data: Data, model: ConfigDict) -> None:
 
 def data_of_run(
     saved: SavedModel, changes: Mapping[str, Any] | None = None
-) -> tuple[ConfigDict, Data]:
+) -> tuple[Config, Data]:
     """Return the config of a run with changes of `config.data`, and the data it describes.
 
     If `changes` replace the roots, the labels, records, embeddings, calibrations and the
@@ -390,23 +387,19 @@ def data_of_run(
             radar grid.
         FileNotFoundError: A folder is missing.
     """
-    config = saved.config.copy_and_resolve_references()
-    options, changes = config.data, dict(changes or {})
-    own = list(options.roots)
+    changes, own = dict(changes or {}), saved.config.data.roots
     roots = changes.pop("roots", own)
     if not roots:
         raise UserError(
             "the model was trained on frames that were never written, there is no split "
             "to evaluate on; give --data ROOT, or use `radejax detect`"
         )
-    if [str(as_path(root).absolute()) for root in roots] != own:
-        whole = {"sequences": (), "weather": (), **dict.fromkeys(DATA_PATHS)}
-        changes = whole | changes
-    with options.ignore_type():
-        options.update(changes)
-    _set_paths(config, roots)
+    if tuple(str(as_path(root).absolute()) for root in roots) != own:
+        paths = dict.fromkeys(name for name in DATA_PATHS if name != "roots")
+        changes = {"sequences": (), "weather": (), **paths} | changes
+    config = _with_paths(saved.config.replace(data=changes), roots)
     data = Data(config, saved.model)
-    found, name = data.frames.grid, f"the radar of {options.roots[0]}"
+    found, name = data.frames.grid, f"the radar of {config.data.roots[0]}"
     expected = f"{records.describe_grid(saved.grid)}, as the model was trained"
     require(found == saved.grid, name, records.describe_grid(found), expected)
     return config, data

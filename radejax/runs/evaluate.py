@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
-from ml_collections import ConfigDict
 
+from radejax.config import Config
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.core.structures import Boxes
@@ -24,7 +24,7 @@ from radejax.evaluation.boxes import Columns, roi_bounds, tables_from_frames, ta
 from radejax.evaluation.evaluation_set import Result
 from radejax.evaluation.report import Report, write_report
 from radejax.evaluation.results import (
-    EvaluationOptions,
+    ReportOptions,
     compute_results,
     make_set,
     name_of_changes,
@@ -53,7 +53,7 @@ class Evaluation:
         data: Data to evaluate on.
         split: "test", "validation", "train", "all" or the path of a split file.
         shuffle_images: Seed for shuffling the images, or None; see `evaluate_run`.
-        **changes: Fields of `EvaluationOptions` to replace.
+        **changes: Fields of `ReportOptions` to replace.
 
     Raises:
         UserError: The split has no frames, or too few images to shuffle.
@@ -61,7 +61,7 @@ class Evaluation:
 
     def __init__(
         self,
-        config: ConfigDict,
+        config: Config,
         data: Data,
         split: str = "test",
         *,
@@ -69,7 +69,7 @@ class Evaluation:
         **changes: Any,
     ) -> None:
         self._config, self._data, self._split = config, data, split
-        options = self._options = EvaluationOptions.from_config(config, **changes)
+        options = self._options = report_options(config, **changes)
         self._source = source_of(data, split, shuffle_images)
         self._frames = data.split(split)
         self._seen: FrameSequence = self._frames
@@ -243,6 +243,32 @@ class Evaluation:
             yield name, draw_frame(self._scene(predictions, index))
 
 
+def report_options(config: Config, **changes: Any) -> ReportOptions:
+    """Return the options of a report on a run.
+
+    Args:
+        config: Config of the run.
+        **changes: Fields to replace.
+
+    Raises:
+        UserError: A value is invalid, or the run does not have one of the classes.
+    """
+    if unknown := sorted(set(changes.get("classes", ())) - set(config.classes)):
+        raise UserError(
+            f"classes has {unknown[0]!r}, expected some of the run's: "
+            f"{', '.join(config.classes)}"
+        )
+    has_versions = config.data.format == "kradar"
+    own = {
+        "classes": config.classes,
+        "label_version": config.data.label_version if has_versions else None,
+        "invalid_sizes": "false_positive",
+        **dict(config.evaluation),
+    }
+    options = ReportOptions(**own | changes)
+    return options.replace(min_score=min(options.min_score, options.score_threshold))
+
+
 def named_aps(results: Sequence[Result]) -> dict[str, float]:
     """Return the APs over all frames by metric and class, and means by m and metric."""
     return {
@@ -279,7 +305,7 @@ def evaluate_run(
             radar-camera model uses the images.
         other: Fields of `config.data` to replace, such as `{"roots": ("/data",)}`.
         run: Name of the run in the report; the workdir's name if None.
-        **changes: Fields of `EvaluationOptions` to replace.
+        **changes: Fields of `ReportOptions` to replace.
 
     Returns:
         The report that was written; None on all processes except the first.
@@ -294,15 +320,15 @@ def evaluate_run(
     workdir = files.as_path(workdir).absolute()
     if not saved.run:
         raise UserError(f"{workdir} is not a run: give a workdir of train.py")
-    usual = EvaluationOptions.from_config(saved.config)
+    usual = report_options(saved.config)
     # This fails before labels are read, which takes long.
-    EvaluationOptions.from_config(saved.config, **changes)
+    report_options(saved.config, **changes)
     config, data = data_of_run(saved, other)
     name = "evaluation" if other is None else f"evaluation_{data_name(other)}"
     name += "" if split == "test" else f"_{files.as_path(split).stem}"
     name += "" if shuffle_images is None else "_shuffled"
     name += "" if step is None else f"_checkpoint_{step}"
-    name += name_of_changes(changes, vars(usual))
+    name += name_of_changes(changes, dict(usual))
     run = run or workdir.name
     if step == "best" and other is None and split in (data.choosing_split, "all"):
         run += f" (chosen on the {data.choosing_split} split)"
@@ -337,7 +363,7 @@ def source_of(
         "split": split,
         "shuffle_images": shuffle_images,
         "simulated": data.frames.is_simulated,
-        **json.loads(data.options.to_json()),
+        **json.loads(data.options.model_dump_json()),
     }
 
 

@@ -27,12 +27,11 @@ from typing import Any
 
 import jax
 import numpy as np
-from ml_collections import ConfigDict
 
 import radejax
 from radejax import models
+from radejax.config import Config
 from radejax.core import files
-from radejax.core.config import without_data_paths
 from radejax.core.errors import require
 from radejax.core.files import PathLike
 from radejax.data.dataset import FrameSequence
@@ -40,7 +39,6 @@ from radejax.data.records import open_embeddings
 from radejax.evaluation.report import Table, number, numbers, write_tables
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.saved import FROZEN_BACKBONE, starting_weights
-from radejax.runs import checks
 from radejax.runs.data import located, open_data
 from radejax.runs.evaluate import Evaluation, named_aps
 from radejax.training import distributed, loop
@@ -51,7 +49,7 @@ _log = logging.getLogger(__name__)
 
 
 def run(
-    config: ConfigDict,
+    config: Config,
     workdir: PathLike,
     *,
     init_from: PathLike | None = None,
@@ -76,7 +74,6 @@ def run(
             left on the disk.
         FileNotFoundError: A path does not exist.
     """
-    checks.check(config)
     config, folder = located(config), files.as_path(workdir).absolute()
     distributed.check_batch_size(config.train.batch_size)
     model, digest = models.build(config.model, config.data.num_frames), None
@@ -143,7 +140,7 @@ def run(
 
 
 @contextlib.contextmanager
-def claimed(workdir: pathlib.Path, config: ConfigDict) -> Iterator[None]:
+def claimed(workdir: pathlib.Path, config: Config) -> Iterator[None]:
     """Locks a workdir for a training with a config while a block runs.
 
     The workdir is created if missing. If it has no checkpoint yet, the given config
@@ -154,7 +151,7 @@ def claimed(workdir: pathlib.Path, config: ConfigDict) -> Iterator[None]:
             another configuration, in which case the message names the fields that differ.
     """
     path = workdir / "config.json"
-    content = without_data_paths(config)
+    content = config.without_data_paths()
     message = (
         f"another training is at work in {files.relative(workdir)}: wait for its end, or "
         "give another --workdir"
@@ -197,7 +194,7 @@ def run_info(
 
 
 def checkpoint_info(
-    config: ConfigDict,
+    config: Config,
     grid: RadarGrid,
     run: Mapping[str, Any],
     same: Mapping[str, Any],
@@ -210,7 +207,7 @@ def checkpoint_info(
         run: Result of `run_info`.
         same: Values by name that must not change when the run continues.
     """
-    values = {"config": json.loads(config.to_json()), "grid": grid.to_dict()}
+    values = {"config": json.loads(config.model_dump_json()), "grid": grid.to_dict()}
     return {**values, "run": dict(run), "same": dict(same)}
 
 
@@ -234,7 +231,7 @@ _KEYS = ("name", "protocol", "score_threshold", "condition", "cls", "space", "io
 
 
 def run_seeds(
-    config: ConfigDict, workdir: PathLike, seeds: Sequence[int], **options: Any
+    config: Config, workdir: PathLike, seeds: Sequence[int], **options: Any
 ) -> pathlib.Path:
     """Runs a config with several seeds, one after the other.
 
@@ -260,10 +257,8 @@ def run_seeds(
     require(len(set(seeds)) == len(seeds), "--seeds", seeds, "different seeds")
     workdir, tables = files.as_path(workdir).absolute(), {}
     for seed in seeds:
-        one = config.copy_and_resolve_references()
-        one.seed = seed
         _log.info("seed %d of %s", seed, list(seeds))
-        folder = run(one, workdir / f"seed{seed}", **options)
+        folder = run(config.replace(seed=seed), workdir / f"seed{seed}", **options)
         metrics = folder / "evaluation" / "metrics.csv"
         if not metrics.exists():
             _log.info("seed %d is not evaluated: it is not finished, or no data", seed)

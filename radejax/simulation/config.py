@@ -1,22 +1,22 @@
-"""The settings of a simulated dataset."""
+"""The options of a simulated dataset."""
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import json
-import math
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from radejax.core import errors
-from radejax.core.config import plain
-from radejax.core.errors import UserError, integer, number, require
+import pydantic
+from annotated_types import Ge, Le
+
+from radejax.core.errors import UserError, require
+from radejax.core.options import AtLeastOne, Count, Options, Positive
 from radejax.geometry.radar_grid import RadarGrid, is_uniform
 from radejax.simulation.radar.tensor import DRAWN, RadarParameters
 
 SIMULATOR_VERSION = 4
-"""Version that increases whenever the same config gives different files than before."""
+"""Version that increases whenever the same options give different files than before."""
 
 # Environment, time and weather of the procedural sequences, used cyclically.
 CONDITIONS = (
@@ -38,25 +38,6 @@ CONDITIONS = (
     ("mountain", "day", "fog"),
 )
 
-
-_RANGES = {
-    "seed": integer(0),
-    "train_sequences": integer(0),
-    "test_sequences": integer(0),
-    "frames_per_sequence": integer(0),
-    "frame_stride": integer(1),
-    "image_width": integer(0),
-    "image_height": integer(0),
-    "vru_density_scale": number(0, 5),  # more leaves no space for other road users
-    "output": errors.one_of("tesseract", "projection"),
-    "camera_mode": errors.one_of("scene", "oracle"),
-    "label_distance_m": errors.POSITIVE,
-    "radar_from_lidar_m": errors.several(number(-math.inf), "three numbers", 3),
-}
-
-DEFAULT_PRESET = "realistic"
-"""Entry of `PRESETS` that `simulation.radar` extends if it does not name one as `preset`."""
-
 PRESETS: dict[str, dict[str, Any]] = {
     "ideal": {},
     "realistic": {
@@ -77,100 +58,138 @@ PRESETS: dict[str, dict[str, Any]] = {
 """Sensors: the fields of `RadarParameters` that differ from its defaults. Of two numbers,
 each sequence draws its own value between them. "ideal" is the sensor of version 0.3."""
 
-FULL_SIZE = {
+
+class ReducedGrid(Options, section="config.simulation.grid"):
+    """Arguments of `RadarGrid.reduced`; None for its defaults, which are K-Radar's."""
+
+    num_doppler: Count
+    num_range: Annotated[int, Ge(2)]
+    num_elevation: Count
+    num_azimuth: Annotated[int, Ge(2)]
+    max_range_m: Positive | None = None
+    max_azimuth_deg: Positive | None = None
+    max_elevation_deg: Positive | None = None
+    max_doppler_mps: Positive | None = None
+
+
+class AxesGrid(Options, section="config.simulation.grid"):
+    """Fields of a `RadarGrid`: bin centers of its axes, and the field of view."""
+
+    range_m: tuple[float, ...]
+    azimuth_rad: tuple[float, ...]
+    elevation_rad: tuple[float, ...]
+    doppler_mps: tuple[float, ...]
+    fov_range_m: float
+    fov_azimuth_rad: float
+
+
+class RadarOptions(Options, section="config.simulation.radar"):
+    """A sensor of `PRESETS`, and the fields of `RadarParameters` that differ from it.
+
+    Two numbers are a range from which each sequence draws.
+    """
+
+    model_config = pydantic.ConfigDict(extra="allow")
+
+    preset: Literal["ideal", "realistic"] = "realistic"
+    """Name of the sensor."""
+
+    @pydantic.model_validator(mode="after")
+    def _check(self) -> RadarOptions:
+        self.make_parameters()
+        return self
+
+    def make_parameters(self) -> RadarParameters:
+        """Returns the parameters of the radar."""
+        fields = PRESETS[self.preset] | (self.model_extra or {})
+        drawn = {n: x for n, x in fields.items() if n in DRAWN and isinstance(x, tuple)}
+        for name, value in drawn.items():
+            expected = "a number, or the lowest and the highest number"
+            require(len(value) == 2, f"{self.section}.{name}", value, expected)
+        ranges = tuple((name, *drawn[name]) for name in sorted(drawn))
+        lowest = {name: low for name, low, _ in ranges}
+        return RadarParameters(**{"ranges": ranges} | fields | lowest)
+
+
+FULL_SIZE: dict[str, Any] = {
     "grid": "kradar",
-    "radar": {"preset": DEFAULT_PRESET},
+    "radar": RadarOptions(),
     "image_width": 1280,
     "image_height": 720,
 }
-"""Fields of a config that simulates K-Radar's own radar and camera."""
+"""Fields of options that simulate K-Radar's own radar and camera."""
 
 
-@dataclasses.dataclass(frozen=True)
-class SimulationConfig:
-    """Settings of a simulated dataset. The defaults give a small dataset for tests.
+class SimulationOptions(Options, section="config.simulation"):
+    """Options of a simulated dataset. The defaults give a small dataset for tests."""
 
-    Attributes:
-        seed: Seed of all random numbers.
-        scenes: "procedural", or the path of a K-Radar label folder or zip.
-        train_sequences: Number of procedural training sequences, numbered from 1. The
-            conditions of procedural sequences repeat `CONDITIONS` cyclically.
-        test_sequences: Number of procedural test sequences, numbered after the training
-            sequences.
-        sequences: Numbers of the sequences to use from real labels, or None for all.
-        label_version: Version of the real labels.
-        frames_per_sequence: Number of frames per sequence, at 10 frames per second in
-            procedural scenes; 0 uses all frames of real labels. Two or more frames of
-            real labels are in both splits of K-Radar.
-        frame_stride: Stride at which the frames of real labels are used.
-        vru_density_scale: Factor on the number of pedestrians, motorcycles and bicycles
-            in procedural training scenes, at most 5. Test scenes are not affected.
-        grid: Arguments of `RadarGrid.reduced`; or the fields of a `RadarGrid`, whose axes
-            are tuples of bin centers, empty without elevation or Doppler; or "kradar".
-        radar: Name of an entry of `PRESETS` as `preset`, and fields of `RadarParameters`
-            that differ from it. Two numbers are a range from which each sequence draws.
-        output: "tesseract" to write 4D tensors in K-Radar's file format, "projection" to
-            write only projections.
-        image_width: Width in pixels of each of the two stereo images; 0 for no images.
-        image_height: Height in pixels of the images.
-        cover_lens: Whether bad weather covers the lens, as often as in K-Radar.
-        camera_mode: "scene" renders everything that the camera sees. "oracle" renders only
-            silhouettes of the objects in the color of their class, as an upper bound for
-            the camera.
-        radar_from_lidar_m: Translation t of `p_radar = p_lidar + t` in meters; its z is
-            the value in K-Radar's own data loaders.
-        label_distance_m: Maximum distance of labeled objects.
-
-    Raises:
-        UserError: A field is out of its range. The message names the field.
-    """
-
-    seed: int = 0
+    seed: Count = 0
+    """Seed of all random numbers."""
     scenes: str = "procedural"
+    """procedural, or the path of a K-Radar label folder or zip."""
     # Many short sequences, as the frames of one sequence resemble each other: a network
     # learns more from 20 roads for 2 seconds than from 10 roads for 4 seconds.
-    train_sequences: int = 20
-    test_sequences: int = 8
+    train_sequences: Count = 20
+    """Number of procedural training sequences, numbered from 1. The conditions of procedural
+    sequences repeat `CONDITIONS` cyclically."""
+    test_sequences: Count = 8
+    """Number of procedural test sequences, numbered after the training sequences."""
     sequences: tuple[int, ...] | None = None
+    """Numbers of the sequences to use from real labels; None: all."""
     label_version: str = "v2.1"
-    frames_per_sequence: int = 20
-    frame_stride: int = 1
-    vru_density_scale: float = 1.0
-    grid: str | Mapping[str, Any] = dataclasses.field(
-        default_factory=lambda: {
-            "num_doppler": 16,
-            "num_range": 64,
-            "num_elevation": 9,
-            "num_azimuth": 56,
-            "max_range_m": 75.6,
-        }
+    """Version of the real labels."""
+    frames_per_sequence: Count = 20
+    """Number of frames per sequence, at 10 frames per second in procedural scenes; 0: all
+    frames of real labels. Two or more frames of real labels are in both splits of K-Radar."""
+    frame_stride: AtLeastOne = 1
+    """Stride at which the frames of real labels are used."""
+    # A larger factor leaves no space for other road users.
+    vru_density_scale: Annotated[float, Ge(0), Le(5)] = 1.0
+    """Factor on the number of pedestrians, motorcycles and bicycles in procedural training
+    scenes. Test scenes are not affected."""
+    grid: Literal["kradar"] | ReducedGrid | AxesGrid = ReducedGrid(
+        num_doppler=16,
+        num_range=64,
+        num_elevation=9,
+        num_azimuth=56,
+        max_range_m=75.6,
     )
-    radar: Mapping[str, Any] = dataclasses.field(
-        default_factory=lambda: {"azimuth_elements": 40.0, "elevation_elements": 12.0}
+    """Axes of the radar: arguments of `RadarGrid.reduced`; or the fields of a `RadarGrid`,
+    whose axes are tuples of bin centers, empty without elevation or Doppler; or kradar."""
+    radar: RadarOptions = RadarOptions.model_validate(
+        {"azimuth_elements": 40.0, "elevation_elements": 12.0}
     )
+    """Parameters of the radar other than its axes."""
     output: Literal["tesseract", "projection"] = "tesseract"
-    image_width: int = 320
-    image_height: int = 180
+    """tesseract to write 4D tensors in K-Radar's file format, projection to write only
+    projections."""
+    image_width: Count = 320
+    """Width in pixels of each of the two stereo images; 0: no images."""
+    image_height: Count = 180
+    """Height in pixels of the images."""
     cover_lens: bool = True
+    """Cover the lens by bad weather as often as in K-Radar."""
     camera_mode: Literal["scene", "oracle"] = "scene"
+    """scene renders everything that the camera sees. oracle renders only silhouettes of the
+    objects in the color of their class, as an upper bound for the camera."""
     radar_from_lidar_m: tuple[float, float, float] = (-2.54, 0.3, 0.7)
-    label_distance_m: float = 90.0
+    """Translation t of `p_radar = p_lidar + t` in meters; its z is the value in K-Radar's own
+    data loaders."""
+    label_distance_m: Positive = 90.0
+    """Maximum distance of labeled objects."""
 
+    @pydantic.field_validator("grid", mode="before")
     @classmethod
-    def from_mapping(cls, values: Mapping[str, Any]) -> SimulationConfig:
-        """Creates settings from plain values or a ConfigDict, with defaults where missing.
+    def _of_form(cls, grid: Any) -> Any:
+        if isinstance(grid, Mapping):
+            return (AxesGrid if "range_m" in grid else ReducedGrid)(**grid)
+        expected = "'kradar', or arguments of RadarGrid.reduced or RadarGrid"
+        is_known = isinstance(grid, Options) or grid == "kradar"
+        require(is_known, "config.simulation.grid", grid, expected)
+        return grid
 
-        Raises:
-            UserError: A field is unknown or out of its range.
-        """
-        values = plain(values)
-        fields = {field.name: field for field in dataclasses.fields(cls)}
-        for name in values:
-            require(name in fields, "config.simulation field", name, ", ".join(fields))
-        return cls(**values)
-
-    def __post_init__(self) -> None:
-        errors.check_options(vars(self), "config.simulation", _RANGES)
+    @pydantic.model_validator(mode="after")
+    def _check(self) -> SimulationOptions:
         if self.scenes == "procedural":
             is_any = self.train_sequences + self.test_sequences > 0
             expected = "a sequence to train or to test on"
@@ -182,27 +201,20 @@ class SimulationConfig:
         else:
             is_one = self.vru_density_scale == 1
             self._require(is_one, "vru_density_scale", "1 for scenes of real labels")
-        is_mapping = isinstance(self.radar, Mapping)
-        self._require(is_mapping, "radar", "a preset and fields of RadarParameters")
-        named = {"preset": DEFAULT_PRESET} | dict(self.radar)
-        object.__setattr__(self, "radar", named)
         self.make_grid()
-        self.make_parameters()
+        return self
 
     def _require(self, holds: bool, name: str, expected: str) -> None:
         require(holds, f"config.simulation.{name}", getattr(self, name), expected)
 
     def make_grid(self) -> RadarGrid:
         """Returns the axes of the radar tensor."""
-        if self.grid == "kradar":
+        if isinstance(self.grid, str):
             return RadarGrid.kradar()
-        fields: Any = self.grid
-        is_mapping = isinstance(fields, Mapping)
-        self._require(is_mapping, "grid", "'kradar' or arguments of RadarGrid.reduced")
+        make = RadarGrid if isinstance(self.grid, AxesGrid) else RadarGrid.reduced
         try:
-            make = RadarGrid if "range_m" in fields else RadarGrid.reduced
-            grid = make(**fields)
-        except (TypeError, ValueError) as error:
+            grid = make(**self.grid.model_dump(exclude_none=True))
+        except ValueError as error:
             raise UserError(f"config.simulation.grid: {error}") from None
         doppler, name = grid.doppler_mps, "config.simulation.grid.doppler_mps"
         require(is_uniform(doppler), name, doppler.tolist(), "uniform bins of an FFT")
@@ -210,40 +222,18 @@ class SimulationConfig:
 
     def make_parameters(self) -> RadarParameters:
         """Returns the parameters of the radar other than its axes."""
-        given = plain(self.radar)
-        preset = given.pop("preset")
-        name = "config.simulation.radar.preset"
-        require(preset in PRESETS, name, preset, f"one of {', '.join(PRESETS)}")
-        fields = PRESETS[preset] | given
-        ranges = []
-        for name in DRAWN & fields.keys():
-            value = fields[name]
-            if isinstance(value, list | tuple):
-                expected = "a number, or the lowest and the highest number"
-                require(
-                    len(value) == 2, f"config.simulation.radar.{name}", value, expected
-                )
-                fields[name] = value[0]
-                ranges.append((name, *value))
-        try:
-            return RadarParameters(**{"ranges": tuple(sorted(ranges))} | fields)
-        except TypeError as error:
-            raise UserError(f"config.simulation.radar: {error}") from None
+        return self.radar.make_parameters()
 
     def to_json(self) -> str:
-        """Returns canonical JSON text, which is equal for equal settings."""
-        return json.dumps(dataclasses.asdict(self), sort_keys=True)
+        """Returns canonical JSON text, which is equal for equal options."""
+        values = self.model_dump(exclude_none=True) | {"sequences": self.sequences}
+        return json.dumps(values, sort_keys=True)
 
     def fingerprint(self) -> str:
-        """Returns a short hash of the settings and the simulator version."""
+        """Returns a short hash of the options and the simulator version."""
         text = f"{SIMULATOR_VERSION} {self.to_json()}"
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def conditions(self, number: int) -> tuple[str, str, str]:
         """Returns environment, time and weather of sequence `number`, counted from 1."""
         return CONDITIONS[(number - 1) % len(CONDITIONS)]
-
-
-def default_config() -> dict[str, Any]:
-    """Returns the fields of `SimulationConfig` with their defaults as a new dictionary."""
-    return dataclasses.asdict(SimulationConfig())

@@ -17,7 +17,7 @@ import logging
 import os
 import pathlib
 import pickle
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from typing import Any, TypeVar
 
 import jax
@@ -33,7 +33,7 @@ from radejax.data.kradar.dataset import SIMULATION_MARKER
 from radejax.data.kradar.labels import Label
 from radejax.geometry.camera import CameraCalibration
 from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibration
-from radejax.simulation.config import SimulationConfig, default_config
+from radejax.simulation.config import SimulationOptions
 from radejax.simulation.radar import tensor
 from radejax.simulation.simulator import (
     FrameSpec,
@@ -42,8 +42,6 @@ from radejax.simulation.simulator import (
     SequenceSimulator,
     make_source,
 )
-
-__all__ = ["default_config", "simulate_dataset"]
 
 _LABELS = "info_label_v2_1"
 _PNG_BYTES_PER_PIXEL = 0.3  # 0.13 to 0.47 measured
@@ -55,7 +53,7 @@ _log = logging.getLogger(__name__)
 
 
 def simulate_dataset(
-    config: Mapping[str, Any],
+    options: SimulationOptions,
     root: str | os.PathLike,
     *,
     num_workers: int | None = None,
@@ -64,7 +62,7 @@ def simulate_dataset(
     """Simulates a dataset into `root`, or finishes or reuses an existing dataset.
 
     Args:
-        config: Mapping or ConfigDict of plain values, as returned by `default_config`.
+        options: Options of the dataset.
         root: Folder of the dataset, which is created if it does not exist.
         num_workers: Number of processes that create scenes and render images. 0 uses only
             this process. None uses as many as CPUs and memory allow, or only this process
@@ -78,44 +76,42 @@ def simulate_dataset(
         K-Radar's, `radar_grid.json`.
 
     Raises:
-        UserError: A config value is invalid, `root` contains other files or a dataset
-            of another config, the disk is full, or a worker was killed.
+        UserError: `root` contains other files or a dataset of other options, the disk is full,
+            or a worker was killed.
     """
-    checked = SimulationConfig.from_mapping(config)
     root = files.as_path(root)
-    if _is_finished(root, checked):
+    if _is_finished(root, options):
         _log.info("Simulated dataset %s is complete: reused.", root)
         return root
-    source = make_source(checked)
-    num_frames, size = expected_size(checked, source)
+    source = make_source(options)
+    num_frames, size = expected_size(options, source)
     _log.info("%s: %d frames, about %.2g GB", root, num_frames, size / 1e9)
-    content = _marker(checked)
+    content = _marker(options)
     with files.disk_full(root / SIMULATION_MARKER):
         files.write_json(root / SIMULATION_MARKER, content)
         files.remove_stale(root)
-        writer = Writer(root, checked, source)
+        writer = Writer(root, options, source)
         writer.write_common()
         writer.write_frames(num_workers, progress)
         files.write_json(root / SIMULATION_MARKER, content | {"finished": True})
     return root
 
 
-def expected_size(config: SimulationConfig, source: SceneSource) -> tuple[int, float]:
+def expected_size(options: SimulationOptions, source: SceneSource) -> tuple[int, float]:
     """Returns the number of frames of a dataset and its approximate size in bytes."""
-    grid = config.make_grid()
-    is_whole = config.output == "tesseract"
+    grid = options.make_grid()
+    is_whole = options.output == "tesseract"
     numbers = np.prod(grid.shape_drea if is_whole else grid.projection_shape)
-    pixels = 2 * config.image_width * config.image_height
+    pixels = 2 * options.image_width * options.image_height
     frames = sum(len(source.frames(number)) for number in source.numbers)
     return frames, frames * (4.0 * numbers + _PNG_BYTES_PER_PIXEL * pixels)
 
 
-def _is_finished(root: pathlib.Path, config: SimulationConfig) -> bool:
-    """Returns True if `root` contains the complete dataset of this config.
+def _is_finished(root: pathlib.Path, options: SimulationOptions) -> bool:
+    """Returns True if `root` contains the complete dataset of these options.
 
     Raises:
-        UserError: `root` is a file, or contains other files or a dataset of another
-            config.
+        UserError: `root` is a file, or contains other files or a dataset of other options.
     """
     if root.exists() and not root.is_dir():
         raise UserError(f"{root} is a file, expected a folder for the dataset")
@@ -128,16 +124,16 @@ def _is_finished(root: pathlib.Path, config: SimulationConfig) -> bool:
             )
         return False
     what = "a dataset of another simulation config"
-    files.claim(marker, _marker(config), what, ignore=("finished",))
+    files.claim(marker, _marker(options), what, ignore=("finished",))
     return files.read_object(marker, "finished")["finished"] is True
 
 
-def _marker(config: SimulationConfig) -> dict[str, Any]:
+def _marker(options: SimulationOptions) -> dict[str, Any]:
     """Returns the content of the marker file of an unfinished dataset."""
     return {
-        "config": json.loads(config.to_json()),
+        "config": json.loads(options.to_json()),
         "finished": False,
-        "fingerprint": config.fingerprint(),
+        "fingerprint": options.fingerprint(),
     }
 
 
@@ -145,14 +141,14 @@ class Writer:
     """Writes the files of a dataset; worker processes have a copy that prepares frames."""
 
     def __init__(
-        self, root: pathlib.Path, config: SimulationConfig, source: SceneSource
+        self, root: pathlib.Path, options: SimulationOptions, source: SceneSource
     ) -> None:
-        self.root, self.config, self.source = root, config, source
-        self.grid, self.parameters = config.make_grid(), config.make_parameters()
+        self.root, self.options, self.source = root, options, source
+        self.grid, self.parameters = options.make_grid(), options.make_parameters()
         self.cameras: tuple[CameraCalibration, ...] = ()  # left and right
-        if config.image_width:
-            size = config.image_width, config.image_height
-            self.cameras = stereo_calibration(config.radar_from_lidar_m, *size)
+        if options.image_width:
+            size = options.image_width, options.image_height
+            self.cameras = stereo_calibration(options.radar_from_lidar_m, *size)
 
     def write_common(self) -> None:
         """Writes the splits, the sensor axes and the camera calibrations."""
@@ -161,7 +157,7 @@ class Writer:
             for spec in self.source.frames(number):
                 names[spec.split].append((number, spec.name))
         kradar_write.write_splits(self.root / "split", **names)
-        if self.config.grid != "kradar":
+        if self.options.grid != "kradar":
             kradar_write.write_grid(self.root, self.grid)
         for index, calibration in enumerate(self.cameras):
             path = self.root / "calib" / "common" / f"cam_front{index}.yml"
@@ -178,7 +174,7 @@ class Writer:
             tensor.simulate,
             grid=self.grid,
             parameters=self.parameters,
-            output=self.config.output,
+            output=self.options.output,
         )
         with (
             tqdm(None, "simulate", total, unit="frame", disable=not progress) as bar,
@@ -205,7 +201,7 @@ class Writer:
             kradar_write.write_description(folder / "description.txt", *conditions)
             radar_idx, lidar_idx, *_ = specs[0].indices
             path = folder / "info_calib" / "calib_radar_lidar.txt"
-            shift_m = self.config.radar_from_lidar_m[:2]
+            shift_m = self.options.radar_from_lidar_m[:2]
             kradar_write.write_calibration(path, radar_idx - lidar_idx, *shift_m)
             there = {path.stem for path in (folder / _LABELS).glob("*.txt")}
             yield from ((number, spec) for spec in specs if spec.name not in there)
@@ -215,7 +211,7 @@ class Writer:
     ) -> None:
         """Writes the radar data of one frame, then its labels."""
         folder, index = self.root / str(number), spec.indices[0]
-        if self.config.output == "tesseract":
+        if self.options.output == "tesseract":
             path = folder / "radar_tesseract" / f"tesseract_{index:05d}.mat"
             tesseract = np.asarray(output).transpose(tensor.TESSERACT_OF_ROWS)
             kradar_write.write_tesseract(path, tesseract)
@@ -228,7 +224,7 @@ class Writer:
 
     def prepare(self, number: int, spec: FrameSpec) -> tuple[RadarInput, list[Label]]:
         """Computes radar input and labels of one frame and writes its image."""
-        config, camera_idx = self.config, spec.indices[2]
+        options, camera_idx = self.options, spec.indices[2]
         simulator, renderer = self._sequence(number)
         frame = simulator.sequence.frame(spec.scene_idx)
         if renderer:
@@ -239,7 +235,7 @@ class Writer:
                 image.save(file, format="PNG", compress_level=1)  # for speed
         given = simulator.radar_input(frame)
         labels = simulator.labels(
-            frame, given, config.radar_from_lidar_m, config.label_distance_m
+            frame, given, options.radar_from_lidar_m, options.label_distance_m
         )
         return given, labels
 
@@ -249,13 +245,15 @@ class Writer:
         return functools.lru_cache(maxsize=2)(self._make)
 
     def _make(self, number: int) -> tuple[SequenceSimulator, CameraRenderer | None]:
-        config, sequence = self.config, self.source.make(number)
-        simulator = SequenceSimulator(sequence, self.grid, self.parameters, config.seed)
+        options, sequence = self.options, self.source.make(number)
+        simulator = SequenceSimulator(
+            sequence, self.grid, self.parameters, options.seed
+        )
         if not self.cameras:
             return simulator, None
-        cover_lens, mode = config.cover_lens, config.camera_mode
+        cover_lens, mode = options.cover_lens, options.camera_mode
         renderer = CameraRenderer(
-            sequence, self.cameras, config.seed, cover_lens=cover_lens, mode=mode
+            sequence, self.cameras, options.seed, cover_lens=cover_lens, mode=mode
         )
         return simulator, renderer
 

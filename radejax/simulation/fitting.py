@@ -16,14 +16,14 @@ from radejax.core.files import PathLike
 from radejax.data.kradar.dataset import read_grid
 from radejax.data.tesseract import read_power
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.simulation.config import SimulationConfig
+from radejax.simulation.config import SimulationOptions
 from radejax.simulation.radar.fit import fit_radar
 from radejax.simulation.simulator import SequenceSimulator, make_source
 from radejax.visualize.draw import draw_comparison
 from radejax.visualize.style import save_figure
 
 FITTED = "radar.json"
-"""File with the fields `grid` and `radar` of a `SimulationConfig`."""
+"""File with the fields `grid` and `radar` of `SimulationOptions`."""
 
 
 def fit_files(recordings: Sequence[PathLike], out: PathLike) -> dict[str, Any]:
@@ -72,11 +72,9 @@ def _mean_db(power: Float[np.ndarray, "D R E A"]) -> Float[np.ndarray, "R A"]:
 
 def _simulated(section: dict[str, Any]) -> Float[np.ndarray, "D R E A"]:
     """Simulates the tensor of one procedural frame."""
-    config = SimulationConfig.from_mapping(
-        {**section, "train_sequences": 1, "frames_per_sequence": 1}
-    )
+    options = SimulationOptions(**section, train_sequences=1, frames_per_sequence=1)
     simulator = SequenceSimulator(
-        make_source(config).make(1), config.make_grid(), config.make_parameters(), 0
+        make_source(options).make(1), options.make_grid(), options.make_parameters(), 0
     )
     given = simulator.radar_input(simulator.sequence.frame(0))
     return simulator.run(given, "tesseract")

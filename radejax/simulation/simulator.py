@@ -17,7 +17,7 @@ from radejax.data.kradar import Frame, KRadar
 from radejax.data.kradar.dataset import split_by_rule
 from radejax.data.kradar.labels import Label, LabelHeader
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.simulation.config import SimulationConfig
+from radejax.simulation.config import SimulationOptions
 from radejax.simulation.radar import propagation, scattering, sensor, tensor
 from radejax.simulation.world import scene
 from radejax.simulation.world.replay import make_real_sequence
@@ -202,18 +202,18 @@ class FrameSpec(NamedTuple):
 class ProceduralSource:
     """Source of procedural sequences, numbered from 1 with training sequences first."""
 
-    def __init__(self, config: SimulationConfig) -> None:
-        self._config = config
-        count = config.train_sequences + config.test_sequences
+    def __init__(self, options: SimulationOptions) -> None:
+        self._options = options
+        count = options.train_sequences + options.test_sequences
         self.numbers = list(range(1, count + 1))
-        self.conditions = config.conditions
+        self.conditions = options.conditions
 
     def frames(self, number: int) -> list[FrameSpec]:
         """Returns the frames of the sequence `number`, in order."""
-        config = self._config
-        rng = np.random.default_rng([config.seed, number, 3])
+        options = self._options
+        rng = np.random.default_rng([options.seed, number, 3])
         radar, camera, long_lidar, others = map(int, rng.integers(1, 42, size=4))
-        split = "train" if number <= config.train_sequences else "test"
+        split = "train" if number <= options.train_sequences else "test"
         start = _FIRST_TIMESTAMP_S + 1000.0 * number
         return [
             FrameSpec(
@@ -222,43 +222,43 @@ class ProceduralSource:
                 timestamp_s=start + scene.FRAME_PERIOD_S * i,
                 split=split,
             )
-            for i, n in enumerate(range(1, config.frames_per_sequence + 1))
+            for i, n in enumerate(range(1, options.frames_per_sequence + 1))
         ]
 
     def make(self, number: int) -> Sequence:
         """Creates the scene of the sequence `number`."""
-        config, (environment, time, weather) = self._config, self.conditions(number)
-        is_training = number <= config.train_sequences
+        options, (environment, time, weather) = self._options, self.conditions(number)
+        is_training = number <= options.train_sequences
         return make_sequence(
             number,
             environment=environment,
             time=time,
             weather=weather,
-            num_frames=config.frames_per_sequence,
-            vru_density_scale=config.vru_density_scale if is_training else 1.0,
-            rng=np.random.default_rng([config.seed, number]),
+            num_frames=options.frames_per_sequence,
+            vru_density_scale=options.vru_density_scale if is_training else 1.0,
+            rng=np.random.default_rng([options.seed, number]),
         )
 
 
 class LabelSource:
     """Source of the sequences in a K-Radar label folder or zip, with K-Radar's split."""
 
-    def __init__(self, config: SimulationConfig) -> None:
-        self._config = config
+    def __init__(self, options: SimulationOptions) -> None:
+        self._options = options
         # Objects outside the field of view are kept, as they can block other objects and
         # appear in images.
         data = KRadar(
-            labels=config.scenes,
-            version=config.label_version,
+            labels=options.scenes,
+            version=options.label_version,
             visibility=None,
             field_of_view=False,
-            sequence_numbers=config.sequences,
+            sequence_numbers=options.sequences,
         )
         self._frames: dict[int, list[Frame]] = collections.defaultdict(list)
         for frame in data:
             self._frames[frame.sequence].append(frame)
         if not self._frames:
-            raise UserError(f"{config.scenes}: no frames of the chosen sequences")
+            raise UserError(f"{options.scenes}: no frames of the chosen sequences")
         self.numbers = sorted(self._frames)
 
     def conditions(self, number: int) -> tuple[str, str, str]:
@@ -268,11 +268,11 @@ class LabelSource:
 
     def frames(self, number: int) -> list[FrameSpec]:
         """Returns the frames of the sequence `number`, in order."""
-        config, frames = self._config, self._frames[number]
+        options, frames = self._options, self._frames[number]
         names = [f.name for f in frames]
         train = set(split_by_rule(names, "train"))
-        chosen = range(0, len(frames), config.frame_stride)
-        if count := config.frames_per_sequence:
+        chosen = range(0, len(frames), options.frame_stride)
+        if count := options.frames_per_sequence:
             # The first frames can all be in the train split. Half of the chosen ones are
             # then those before the first test frame.
             is_test = [names[index] not in train for index in chosen]
@@ -293,8 +293,8 @@ class LabelSource:
         """Creates the scene of the sequence `number`."""
         return make_real_sequence(
             self._frames[number],
-            radar_from_lidar_m=self._config.radar_from_lidar_m,
-            rng=np.random.default_rng([self._config.seed, number]),
+            radar_from_lidar_m=self._options.radar_from_lidar_m,
+            rng=np.random.default_rng([self._options.seed, number]),
         )
 
 
@@ -311,6 +311,7 @@ def _header_indices(header: LabelHeader) -> tuple[int, int, int, int, int]:
 SceneSource = ProceduralSource | LabelSource
 
 
-def make_source(config: SimulationConfig) -> SceneSource:
-    """Creates the source of scenes selected by a config."""
-    return (ProceduralSource if config.scenes == "procedural" else LabelSource)(config)
+def make_source(options: SimulationOptions) -> SceneSource:
+    """Creates the source of scenes that the options select."""
+    is_procedural = options.scenes == "procedural"
+    return (ProceduralSource if is_procedural else LabelSource)(options)

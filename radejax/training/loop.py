@@ -17,12 +17,11 @@ import numpy as np
 import optax
 from jax.extend.core import ClosedJaxpr
 from jax.interpreters import partial_eval
-from ml_collections import ConfigDict
 
+from radejax.config import Config
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import Batch
-from radejax.detection.decode import DecodeOptions
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.training import distributed
 from radejax.training.checkpoints import Checkpoints
@@ -52,7 +51,7 @@ TrainStep = Callable[[TrainState, Batch], tuple[TrainState, Metrics]]
 
 
 def train(
-    config: ConfigDict,
+    config: Config,
     model: nn.Module,
     loader: Any,
     grid: RadarGrid,
@@ -68,7 +67,7 @@ def train(
     """Trains a model for the configured epochs or steps, or continues from the newest checkpoint.
 
     Args:
-        config: Config of the run, which `radejax.runs.checks.check` has checked. The
+        config: Config of the run, of which the
             fields `seed`, `train`, `loss`, `decode` and `logging` are used.
         model: Model, which is called as `model.apply(variables, *inputs, train=True)`.
         loader: Endless, checkpointable grain iterator of `Batch`.
@@ -99,7 +98,12 @@ def train(
     schedule = make_schedule(options, steps_per_epoch)
     optimizer = make_optimizer(options, schedule)
     step_fn = make_train_step(
-        model, optimizer, grid, loss=loss_options(config), ema_decay=options.ema_decay
+        model,
+        optimizer,
+        grid,
+        loss=config.loss,
+        decoding=config.decode,
+        ema_decay=options.ema_decay,
     )
     create = functools.partial(
         create_state,
@@ -140,7 +144,7 @@ def _trace(folder: str) -> contextlib.AbstractContextManager[None]:
 class _Run:
     """Takes the steps of a run; the attributes are arguments and objects of `train`."""
 
-    config: ConfigDict
+    config: Config
     steps_per_epoch: int
     num_steps: int
     loader: Any
@@ -301,14 +305,6 @@ def _evaluate(traced: ClosedJaxpr, shapes: Any) -> Any:
     needed, _ = partial_eval.dce_jaxpr(traced.jaxpr, is_result, instantiate=True)
     leaves = jax.core.eval_jaxpr(needed, traced.consts)
     return jax.tree.unflatten(jax.tree.structure(shapes), map(np.asarray, leaves))
-
-
-def loss_options(config: ConfigDict) -> dict[str, Any]:
-    """Returns the keyword arguments of `detection_loss` for a config.
-
-    They include `config.decode`, whose thresholds the assignment "nms" uses.
-    """
-    return {**config.loss.to_dict(), "decoding": DecodeOptions(**config.decode)}
 
 
 def _empty_batch(loader: Any) -> Batch:

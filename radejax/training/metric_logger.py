@@ -16,8 +16,8 @@ import numpy as np
 import tensorboardX
 import tqdm
 from matplotlib.figure import Figure
-from ml_collections import ConfigDict
 
+from radejax.config import Config
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
 from radejax.core.workers import usable_cpus
@@ -64,7 +64,7 @@ class MetricLogger:
     def __init__(
         self,
         folder: pathlib.Path,
-        config: ConfigDict,
+        config: Config,
         start_step: int,
         num_steps: int,
     ) -> None:
@@ -218,7 +218,7 @@ def _remove_after(step: int, path: pathlib.Path) -> None:
     files.write_text(path, "".join(kept))
 
 
-def _start_wandb(folder: pathlib.Path, config: ConfigDict) -> Any:
+def _start_wandb(folder: pathlib.Path, config: Config) -> Any:
     """Starts or resumes a workdir's run at Weights & Biases, which mirrors TensorBoard."""
     try:
         import wandb
@@ -234,5 +234,5 @@ def _start_wandb(folder: pathlib.Path, config: ConfigDict) -> Any:
         dir=str(folder),
         sync_tensorboard=True,
         project=config.logging.wandb_project,
-        config=json.loads(config.to_json()),
+        config=config.to_dict(),
     )

@@ -15,12 +15,13 @@ import optax
 from flax import struct
 from jax.typing import ArrayLike
 from jaxtyping import Float, Int, Num
-from ml_collections import ConfigDict
 
 from radejax.core.errors import UserError, require
 from radejax.core.structures import Batch
+from radejax.detection.decode import DecodeOptions
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.losses.detection import detection_loss
+from radejax.losses.detection import LossOptions, detection_loss
+from radejax.training.options import TrainOptions
 
 Metrics = dict[str, Num[jax.Array, ""]]
 Step = Callable[["TrainState", Batch, jax.Array], tuple["TrainState", Metrics]]
@@ -29,13 +30,13 @@ Step = Callable[["TrainState", Batch, jax.Array], tuple["TrainState", Metrics]]
 # Optimizer ---------------------------------------------------------------------------
 
 
-def count_steps(train: ConfigDict, steps_per_epoch: int) -> int:
+def count_steps(train: TrainOptions, steps_per_epoch: int) -> int:
     """Returns the number of steps of a training with the section `config.train`."""
     steps: int = steps_per_epoch * train.num_epochs
     return steps if train.max_steps is None else min(train.max_steps, steps)
 
 
-def make_schedule(train: ConfigDict, steps_per_epoch: int) -> optax.Schedule:
+def make_schedule(train: TrainOptions, steps_per_epoch: int) -> optax.Schedule:
     """Linear warm-up from zero, then a cosine between the peak and the minimum.
 
     RADE-Net section IV-B uses a cosine per step from 1e-3 to 1e-4 without warm-up.
@@ -84,7 +85,7 @@ def _cyclic_cosine(peak: float, minimum: float, half_period: int) -> optax.Sched
 
 
 def make_optimizer(
-    train: ConfigDict, schedule: optax.Schedule
+    train: TrainOptions, schedule: optax.Schedule
 ) -> optax.GradientTransformation:
     """Creates AdamW with torch's defaults and weight decay on every parameter.
 
@@ -227,7 +228,8 @@ def make_train_step(
     optimizer: optax.GradientTransformation,
     grid: RadarGrid,
     *,
-    loss: Mapping[str, Any],
+    loss: LossOptions,
+    decoding: DecodeOptions | None = None,
     ema_decay: float | None = None,
 ) -> Step:
     """Builds the function that computes one training step.
@@ -239,7 +241,8 @@ def make_train_step(
         model: Radar or radar-camera detector.
         optimizer: Optimizer that `make_optimizer` returned.
         grid: Grid of the model's maps.
-        loss: Keyword arguments of `detection_loss`.
+        loss: Options of the loss.
+        decoding: Thresholds for the assignment "nms", see `detection_loss`.
         ema_decay: Decay of the parameters' moving average, or None.
 
     Returns:
@@ -258,7 +261,7 @@ def make_train_step(
             mutable=list(state.model_state),
         )
         with jax.named_scope("losses"):
-            total, parts = detection_loss(maps, batch, grid, **loss)
+            total, parts = detection_loss(maps, batch, grid, loss, decoding)
         return total, (model_state, parts)
 
     def step(

@@ -168,11 +168,12 @@ def _torch_axes(path: str, ndim: int) -> tuple[int, ...]:
 
 def variable_shapes(model: Any) -> dict[str, tuple[int, ...]]:
     """Return the shapes of a detector's variables by path, without creating the variables."""
-    bins, channels = model.pad_multiple, model.doppler_bins + model.elevation_bins
+    options = model.options
+    bins, channels = options.pad_multiple, options.doppler_bins + options.elevation_bins
     shape = (1, bins, bins, model.num_frames * channels)
     inputs: list[Any] = [np.zeros(shape, np.float32)]
     if models.has_camera(model):
-        inputs += no_images(1, model.image_size)
+        inputs += no_images(1, options.image.size)
     return shapes_of(jax.eval_shape(model.init, jax.random.key(0), *inputs))
 
 

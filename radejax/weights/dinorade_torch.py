@@ -12,10 +12,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from radejax import models
-from radejax.core.config import load_config
 from radejax.core.errors import DataError, require
 from radejax.core.files import PathLike
 from radejax.models.dinorade import IMAGE_BACKBONE
+from radejax.models.options import OFFICIAL_DINORADE, DinoRadeOptions, FusionOptions
 from radejax.weights import convert, dinov3_hf, radenet_torch
 from radejax.weights.convert import Rules, StateDict
 from radejax.weights.image_backbone import RESNET_RULES
@@ -32,8 +32,8 @@ def read(
     source: str,
     dinov3: PathLike | None = None,
     **model_overrides: Any,
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return `config.model` and the variables of tensors by official name.
+) -> tuple[DinoRadeOptions, dict[str, Any]]:
+    """Return the options and the variables of tensors by official name.
 
     The geometry is the released one. The camera is `CameraCalibration.from_kradar(file,
     radar_from_lidar_m=OFFICIAL_OFFSET_M).camera("pinhole")`, see `radejax.models.lifting`.
@@ -49,7 +49,7 @@ def read(
             those inferred from names and shapes and the defaults.
 
     Returns:
-        The fields of `config.model`, and `{"params": ..., "batch_stats": ...}` in float32.
+        `config.model`, and `{"params": ..., "batch_stats": ...}` in float32.
 
     Raises:
         FileNotFoundError: The folder or a file in it is missing.
@@ -59,30 +59,29 @@ def read(
             shape. The message lists up to 20 of them.
     """
     tensors = without_lora(tensors)
-    config = load_config("dinorade:official").model.to_dict()
-    fusion = config["fusion"]
-    of_fusion = {k: v for k, v in model_overrides.items() if k in fusion}
-    of_radar = {k: v for k, v in model_overrides.items() if k not in fusion}
-    config |= radenet_torch.infer_config(tensors, source, of_radar, "rad_")
-    fusion |= infer_fusion(tensors, of_fusion)
+    names = FusionOptions.model_fields
+    of_fusion = {k: v for k, v in model_overrides.items() if k in names}
+    of_radar = {k: v for k, v in model_overrides.items() if k not in names}
+    fields = radenet_torch.infer_fields(tensors, source, of_radar, "rad_")
+    fields["fusion"] = infer_fusion(tensors, of_fusion)
     backbone = None
     is_resnet = any(n.startswith("image_backbone.frozen_layers.") for n in tensors)
     is_resnet = is_resnet and dinov3 is None
     if is_resnet:
         # The released code only scales the images of its ResNet to [0, 1].
-        config["image"] |= {"kind": "resnet50", "standardize": False}
-        shapes = convert.variable_shapes(models.build(config))
+        fields["image"] = {"kind": "resnet50", "standardize": False}
     else:
-        fields, backbone = _transformer(tensors, source, dinov3)
-        config["image"] |= fields
+        fields["image"], backbone = _transformer(tensors, source, dinov3)
         tensors = {k: v for k, v in tensors.items() if not k.startswith(IMAGE_BACKBONE)}
-        shapes = convert.variable_shapes(models.build(config))
+    options = OFFICIAL_DINORADE.replace(**fields)
+    shapes = convert.variable_shapes(models.build(options))
+    if not is_resnet:
         shapes = {k: s for k, s in shapes.items() if f"/{IMAGE_BACKBONE}/" not in k}
-    names = rules(config["heads"], is_resnet)
-    variables = convert.from_torch(names, shapes, tensors, source, _UNUSED)
+    ours = rules(options.heads, is_resnet)
+    variables = convert.from_torch(ours, shapes, tensors, source, _UNUSED)
     if backbone is not None:
         variables["params"][IMAGE_BACKBONE] = backbone
-    return config, variables
+    return options, variables
 
 
 def _transformer(
@@ -91,8 +90,9 @@ def _transformer(
     """Return fields and parameters of the transformer in the folder, else the checkpoint."""
     if dinov3 is not None:
         vit, variables = dinov3_hf.load(dinov3)
-        require(not vit.position_grid, str(dinov3), "DINOv2", f"DINOv3 as in {source}")
-        return dinov3_hf.image_fields(vit), variables["params"]
+        is_dinov3 = not vit.options.position_grid
+        require(is_dinov3, str(dinov3), "DINOv2", f"DINOv3 as in {source}")
+        return dinov3_hf.image_fields(vit.options), variables["params"]
     # PEFT and transformers add prefixes to the names of the backbone.
     start = re.compile(rf"{IMAGE_BACKBONE}\.(base_model\.model\.)?(model\.)?")
     own = {start.sub("", k): v for k, v in tensors.items() if start.match(k)}
@@ -100,7 +100,7 @@ def _transformer(
         return {}, None
     vit = dinov3_hf.model_from_tensors(own, source)
     params = dinov3_hf.to_params(vit, own, f"{IMAGE_BACKBONE} of {source}")
-    return dinov3_hf.image_fields(vit), params
+    return dinov3_hf.image_fields(vit.options), params
 
 
 def infer_fusion(tensors: StateDict, overrides: Mapping[str, Any]) -> dict[str, Any]:

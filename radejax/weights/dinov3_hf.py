@@ -28,6 +28,7 @@ import safetensors.numpy
 from radejax.core import files
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import PathLike
+from radejax.models.options import ViTOptions
 from radejax.models.vit import ViT
 from radejax.weights import convert
 from radejax.weights.convert import Rules, StateDict, to_numpy
@@ -44,7 +45,7 @@ _FIELDS = {
     "num_register_tokens": "num_registers",
     "use_gated_mlp": "gated_mlp",
 }
-"""Attributes of `ViT` by the name of the corresponding field of Hugging Face's config."""
+"""Fields of `ViTOptions` by the name of the corresponding field of Hugging Face's config."""
 
 _KINDS = r"dinov3_vit|dinov2|dinov2_with_registers|vit_\w+_dinov3(_qkvb)?"
 """Names of models in transformers ("model_type") and, with "vit", in timm ("architecture")."""
@@ -167,7 +168,7 @@ def load(folder: PathLike) -> tuple[ViT, dict[str, Any]]:
     model = model_from_tensors(tensors, source)
     if "model_type" in config:
         try:
-            model = model_from_config(config, model)
+            model = model_from_config(config, model.options)
         except UserError as error:
             raise UserError(f"{path.with_name(CONFIG_FILE)}: {error}") from None
     return model, {"params": to_params(model, tensors, source)}
@@ -202,10 +203,11 @@ def save(model: ViT, params: Mapping[str, Any], folder: PathLike) -> None:
         params: Parameters of the model, such as `load(folder)[1]["params"]`.
         folder: Folder, which is created if necessary. Existing files are replaced.
     """
-    require(not model.position_grid, "position_grid", model.position_grid, "0, DINOv3")
+    options, name = model.options, "position_grid"
+    require(not options.position_grid, name, options.position_grid, "0, DINOv3")
     folder = files.as_path(folder)
-    config = {theirs: getattr(model, ours) for theirs, ours in _FIELDS.items()}
-    config |= _constants(model.gated_mlp)
+    config = {theirs: getattr(options, ours) for theirs, ours in _FIELDS.items()}
+    config |= _constants(options.gated_mlp)
     config |= {"architectures": ["DINOv3ViTModel"], "layerscale_value": 1.0}
     files.write_json(folder / CONFIG_FILE, config)
     content = safetensors.numpy.save(to_tensors(model, params), {"format": "pt"})
@@ -213,12 +215,14 @@ def save(model: ViT, params: Mapping[str, Any], folder: PathLike) -> None:
         file.write(content)
 
 
-def model_from_config(config: Mapping[str, Any], sizes: ViT | None = None) -> ViT:
+def model_from_config(
+    config: Mapping[str, Any], sizes: ViTOptions | None = None
+) -> ViT:
     """Create the model that a Hugging Face `config.json` describes.
 
     Args:
         config: Content of the file.
-        sizes: Model whose fields are used where DINOv2's config has none. Not needed for
+        sizes: Options whose fields are used where DINOv2's config has none. Not needed for
             DINOv3.
 
     Raises:
@@ -233,7 +237,7 @@ def model_from_config(config: Mapping[str, Any], sizes: ViT | None = None) -> Vi
     for name, value in constants.items():
         require(config.get(name) == value, name, config.get(name), f"{value!r}")
     fields = {_FIELDS[name]: config[name] for name in _FIELDS if name in config}
-    return (sizes or ViT()).clone(**fields)
+    return ViT((sizes or ViTOptions()).replace(**fields))
 
 
 def model_from_tensors(tensors: StateDict, source: str) -> ViT:
@@ -261,7 +265,7 @@ def model_from_tensors(tensors: StateDict, source: str) -> ViT:
         expected = 100.0 ** (np.arange(periods.size) / periods.size)
         if not np.allclose(periods, expected, rtol=0.01):  # may be rounded to bfloat16
             raise UserError(f"{source}: {_PERIODS} are not powers of 100")
-    return ViT(
+    options = ViTOptions(
         hidden_size=hidden,
         num_layers=len(layers),
         num_heads=max(hidden // head_dim, 1),
@@ -271,11 +275,12 @@ def model_from_tensors(tensors: StateDict, source: str) -> ViT:
         position_grid=math.isqrt(max(num_positions - 1, 0)),
         gated_mlp="layer.0.mlp.gate_proj.weight" in tensors,
     )
+    return ViT(options)
 
 
-def image_fields(model: ViT) -> dict[str, Any]:
+def image_fields(options: ViTOptions) -> dict[str, Any]:
     """Return the fields of `config.model.image` that describe a backbone."""
-    return {n: getattr(model, n) for n in (*_FIELDS.values(), "position_grid")}
+    return {n: getattr(options, n) for n in (*_FIELDS.values(), "position_grid")}
 
 
 def to_params(
@@ -294,24 +299,26 @@ def to_params(
         tensors[_CLASS] = np.concatenate(tokens, 1)
         del tensors[_REGISTERS]
     for name in [name for name in tensors if name.endswith(".k_proj.bias")]:
-        if model.position_grid or not np.any(tensors[name]):
+        if model.options.position_grid or not np.any(tensors[name]):
             del tensors[name]  # it has no effect, see `vit.Block`
     # Only used in pretraining, and checked in `model_from_tensors`.
     ignored = rf"(embeddings\.)?mask_token$|local_cls_norm\.|{_PERIODS}$|.*\.bias_mask$"
-    image = np.zeros((1, model.patch_size, model.patch_size, 3), np.float32)
+    size = model.options.patch_size
+    image = np.zeros((1, size, size, 3), np.float32)
     shapes = convert.shapes_of(jax.eval_shape(model.init, jax.random.key(0), image))
     return convert.from_torch(_RULES, shapes, tensors, source, ignored)["params"]
 
 
 def to_tensors(model: ViT, params: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """Invert `to_params` and add a mask token of zeros."""
-    size, params = model.patch_size, dict(params)
+    options, params = model.options, dict(params)
+    size = options.patch_size
     patches = dict(params["patch_embed"])
     patches["kernel"] = np.reshape(patches["kernel"], (size, size, 3, -1))
     tensors = convert.to_torch(_RULES, {"params": params | {"patch_embed": patches}})
     tokens = tensors[_CLASS]
     tensors[_CLASS] = np.ascontiguousarray(tokens[:, :1])
-    if model.num_registers:
+    if options.num_registers:
         tensors[_REGISTERS] = np.ascontiguousarray(tokens[:, 1:])
-    mask = np.zeros((1, 1, model.hidden_size), np.float32)
+    mask = np.zeros((1, 1, options.hidden_size), np.float32)
     return tensors | {"embeddings.mask_token": mask}

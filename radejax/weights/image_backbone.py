@@ -10,7 +10,6 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-import flax.linen as nn
 import jax
 import numpy as np
 import safetensors.numpy
@@ -19,12 +18,13 @@ from radejax import models
 from radejax.core.errors import UserError
 from radejax.core.files import PathLike, differences
 from radejax.models.dinorade import IMAGE_BACKBONE
+from radejax.models.radenet import RadeNet
 from radejax.weights import convert, dinov3_hf
 from radejax.weights.convert import Rules
 
 
 def load_image_backbone(
-    path: PathLike | None, model: nn.Module, embeddings_sha256: str | None = None
+    path: PathLike | None, model: RadeNet, embeddings_sha256: str | None = None
 ) -> Mapping[str, Any] | None:
     """Load pretrained variables for `radejax.training.step.with_pretrained`.
 
@@ -47,10 +47,10 @@ def load_image_backbone(
             computed the embeddings; the model has no camera; or a frozen backbone has no
             weights (nor embeddings, which suffice for a transformer).
     """
-    has_camera = models.has_camera(model)
+    image = model.options.image if models.has_camera(model) else None
     if path is None:
-        is_embedded = embeddings_sha256 and has_camera and model.vit is not None
-        if has_camera and model.freeze and not is_embedded:
+        is_embedded = embeddings_sha256 and image is not None and image.kind == "vit"
+        if image is not None and image.freeze and not is_embedded:
             raise UserError(
                 "config.model.image.freeze is True, but no weights are given: "
                 "--image-backbone FOLDER (DINOv3 or DINOv2 from Hugging Face: config.json "
@@ -58,17 +58,17 @@ def load_image_backbone(
                 "with --config.model.image.freeze=False"
             )
         return None
-    if not has_camera:
+    if image is None:
         raise UserError(
             f"image backbone weights are given, but {type(model).__name__} has no camera"
         )
-    if model.vit is None:
+    if image.kind == "resnet50":
         part = load_resnet(path, model)
     else:
         vit, variables = dinov3_hf.load(path)
-        theirs, ours = map(dinov3_hf.image_fields, (vit, model.vit))
+        theirs, ours = map(dinov3_hf.image_fields, (vit.options, image))
         if lines := differences(theirs, ours, "config.model.image"):
-            kind = "DINOv2" if vit.position_grid else "DINOv3"
+            kind = "DINOv2" if vit.options.position_grid else "DINOv3"
             raise UserError(
                 f"{path} is {kind}, another backbone than config.model.image: "
                 f"{'; '.join(lines)} (dinorade:rcw_dinov2 is the config for DINOv2)"
@@ -98,9 +98,7 @@ def check_same_backbone(params: Any, sha256: str, source: PathLike) -> None:
         )
 
 
-def check_fits(
-    model: nn.Module, variables: Mapping[str, Any], source: PathLike
-) -> None:
+def check_fits(model: RadeNet, variables: Mapping[str, Any], source: PathLike) -> None:
     """Raise a `UserError` unless variables fit a model; the backbone may be missing."""
     wanted, found = convert.variable_shapes(model), convert.shapes_of(variables)
     if IMAGE_BACKBONE not in variables.get("params", {}):
@@ -138,7 +136,7 @@ RESNET_RULES: Rules = (
 
 
 def load_resnet(
-    state_dict_or_path: Mapping[str, Any] | PathLike, model: nn.Module
+    state_dict_or_path: Mapping[str, Any] | PathLike, model: RadeNet
 ) -> dict[str, Any]:
     """Load the variables of DinoRADE's ResNet from torchvision's `resnet50-*.pth`.
 

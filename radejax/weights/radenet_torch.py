@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from radejax import models
-from radejax.core.config import load_config
 from radejax.core.errors import DataError, UserError
+from radejax.models.options import OFFICIAL_RADENET, RadeNetOptions
 from radejax.models.radenet import RadeNet
 from radejax.weights import convert
 from radejax.weights.convert import Rules, StateDict
@@ -23,8 +23,8 @@ _UNUSED_CBAM = r"(rad_)?backbone\.cbam_"  # official models without CBAM have th
 
 def read(
     tensors: StateDict, source: str, **model_overrides: Any
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return `config.model` and the variables of tensors by official name.
+) -> tuple[RadeNetOptions, dict[str, Any]]:
+    """Return the options and the variables of tensors by official name.
 
     The maps include the padding; their grid for official weights is
     `RadarGrid.kradar().padded(8, "stretched")`.
@@ -33,23 +33,23 @@ def read(
         tensors: Tensors by official name, see `convert.read_state_dict`.
         source: Name of the tensors in error messages.
         **model_overrides: Fields of `config.model`, which replace those inferred from names
-            and shapes and the defaults. `cbam=None` is needed for released models without
+            and shapes and the defaults. `cbam="off"` is needed for released models without
             CBAM, as they contain its tensors, and `num_groups` for other than 32 groups.
 
     Returns:
-        The fields of `config.model`, and `{"params": ...}` with float32 arrays.
+        `config.model`, and `{"params": ...}` with float32 arrays.
 
     Raises:
         UserError: An override is unknown or invalid, or `doppler_bins` and `elevation_bins`
-            are needed and missing, see `infer_config`.
+            are needed and missing, see `infer_fields`.
         DataError: Tensors are missing, unexpected or of another shape. The message lists up
             to 20 of them.
     """
-    config = load_config("radenet:official").model.to_dict()
-    config |= infer_config(tensors, source, model_overrides)
-    shapes = convert.variable_shapes(models.build(config))
-    names = rules(config["heads"])
-    return config, convert.from_torch(names, shapes, tensors, source, _UNUSED_CBAM)
+    fields = infer_fields(tensors, source, model_overrides)
+    options = OFFICIAL_RADENET.replace(**fields)
+    shapes = convert.variable_shapes(models.build(options))
+    names = rules(options.heads)
+    return options, convert.from_torch(names, shapes, tensors, source, _UNUSED_CBAM)
 
 
 def save(model: RadeNet, variables: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -72,20 +72,22 @@ def save(model: RadeNet, variables: Mapping[str, Any]) -> dict[str, np.ndarray]:
         UserError: The model has `cbam="paper"` or an `input_center` or `input_scale`, which
             have no official counterpart.
     """
-    if model.cbam == "paper":
+    options = model.options
+    if options.cbam == "paper":
         raise UserError(
-            'the official code has no cbam="paper", only "official" and None'
+            'the official code has no cbam="paper", only "official" and "off"'
         )
-    if (model.input_center, model.input_scale) != (0.0, 1.0):
+    if (options.input_center, options.input_scale) != (0.0, 1.0):
         # They cannot be merged into the first weights, because zeros are padded after them.
         raise UserError(
             "the official code's network takes the projection as it is; this model has "
-            f"input_center={model.input_center} and input_scale={model.input_scale}: "
+            f"input_center={options.input_center} and input_scale={options.input_scale}: "
             "train with 0 and 1 to save it for that code"
         )
-    state = convert.to_torch(rules(model.heads), {"params": variables["params"]})
-    if model.cbam is None:
-        for name, shape in torch_shapes(model.clone(cbam="official")).items():
+    state = convert.to_torch(rules(options.heads), {"params": variables["params"]})
+    if options.cbam == "off":
+        whole = RadeNet(options.replace(cbam="official"), model.num_frames)
+        for name, shape in torch_shapes(whole).items():
             is_scale = len(shape) == 1 and name.endswith("weight")
             state.setdefault(name, np.full(shape, float(is_scale), np.float32))
     return state
@@ -94,8 +96,8 @@ def save(model: RadeNet, variables: Mapping[str, Any]) -> dict[str, np.ndarray]:
 # Configuration -----------------------------------------------------------------------
 
 
-def infer_config(
-    tensors: StateDict, source: str, overrides: StateDict, prefix: str = ""
+def infer_fields(
+    tensors: StateDict, source: str, overrides: Mapping[str, Any], prefix: str = ""
 ) -> dict[str, Any]:
     """Infer fields of `config.model` from names and shapes, and apply the overrides.
 
@@ -148,9 +150,7 @@ def infer_config(
                 f"{source}: the model reads {channels} channels and nothing shows how "
                 "many are Doppler; give doppler_bins and elevation_bins"
             )
-    fields |= overrides
-    fields["cbam"] = fields["cbam"] or "off"
-    return fields
+    return fields | dict(overrides)
 
 
 # Names -------------------------------------------------------------------------------
@@ -203,7 +203,7 @@ def neck_rules(ours: str, theirs: str) -> Rules:
 
 def torch_shapes(model: RadeNet) -> dict[str, tuple[int, ...]]:
     """Return the shapes of the official tensors that a model uses, by official name."""
-    names = rules(model.heads)
+    names = rules(model.options.heads)
     shapes = {}
     for path, shape in convert.variable_shapes(model).items():
         # A broadcast scalar has the shape without using the memory.

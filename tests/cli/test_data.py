@@ -12,7 +12,7 @@ import pytest
 
 from radejax import Detector, KRadar, models
 from radejax.cli import figures, main
-from radejax.core.config import base_config
+from radejax.config import Config
 from radejax.core.errors import DataError, UserError
 from radejax.data.cameras import CameraOptions
 from radejax.data.records import Records
@@ -20,7 +20,8 @@ from radejax.data.tesseract import read_tesseract
 from radejax.inference.detect_files import find_frames, front_images
 from radejax.inference.export import export
 from radejax.inference.saved import SavedModel, save_model
-from radejax.simulation.config import default_config
+from radejax.models.options import DinoRadeOptions, ImageOptions
+from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
 
 from .. import small_models as small
@@ -38,14 +39,10 @@ def _run(*arguments: object, code: int = 0) -> click.testing.Result:
 @pytest.fixture(scope="module")
 def tensors(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     """A simulated root with radar tensors."""
-    simulation = default_config()
-    simulation.update(train_sequences=2, test_sequences=1, frames_per_sequence=4)
-    simulation["grid"] |= {
-        "num_doppler": 4,
-        "num_range": 24,
-        "num_elevation": 3,
-        "num_azimuth": 16,
-    }
+    grid = {"num_doppler": 4, "num_range": 24, "num_elevation": 3, "num_azimuth": 16}
+    simulation = SimulationOptions(
+        train_sequences=2, test_sequences=1, frames_per_sequence=4
+    ).replace(grid=grid)
     root = tmp_path_factory.mktemp("simulated") / "root"
     return simulate_dataset(simulation, root, progress=False)
 
@@ -75,9 +72,9 @@ def disks(
 
 def _model(doppler_bins: int, root: pathlib.Path, release: str | None) -> SavedModel:
     """An untrained radar-only model for the simulated radar."""
-    config = small.radar_config()
-    config.data.release = release
-    config.model.update(doppler_bins=doppler_bins, elevation_bins=3)
+    config = small.radar_config().replace(
+        data={"release": release}, model={"doppler_bins": doppler_bins}
+    )
     grid = KRadar(root).grid
     grid = grid if doppler_bins else grid.without_doppler()
     model = models.build(config.model)
@@ -171,9 +168,9 @@ def test_images_on_another_disk_are_found(disks: Any) -> None:
     paths = find_frames(roots)
     assert len(paths) == 12
     detector: Any = SimpleNamespace(
-        model=SimpleNamespace(image_size=(180, 320)),
+        model=models.build(DinoRadeOptions(image=ImageOptions(size=(180, 320)))),
         camera_options=CameraOptions(),
-        saved=SimpleNamespace(config=base_config()),
+        saved=SimpleNamespace(config=Config()),
     )
     found = front_images(paths, detector, labels, roots=roots)
     assert set(found) == set(paths)
@@ -240,11 +237,12 @@ def test_a_run_is_trained_evaluated_and_detects(
     from radejax.cli.train import train
 
     release, roots, labels = disks
-    config = small.radar_config()
-    config.model.update(doppler_bins=doppler_bins, elevation_bins=3)
-    config.data.release = release
-    config.train.update(batch_size=4, num_epochs=1, checkpoint_every_steps=1)
-    config.evaluation.num_visualizations = 1
+    config = small.radar_config().replace(
+        model={"doppler_bins": doppler_bins},
+        data={"release": release},
+        train={"batch_size": 4, "num_epochs": 1, "checkpoint_every_steps": 1},
+        evaluation={"num_visualizations": 1},
+    )
     path = small.write_config(tmp_path / "config.py", config)
     data = ["--data", ",".join(map(str, roots)), "--labels", str(labels)]
     words = [f"--config={path}", *data, f"--workdir={tmp_path / 'run'}"]

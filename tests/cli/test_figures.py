@@ -12,17 +12,20 @@ from PIL import Image
 import radejax
 from radejax.cli.figures import overlay, viewer_scenes
 from radejax.data.kradar import KRadar
-from radejax.simulation.dataset import default_config, simulate_dataset
+from radejax.simulation.config import SimulationOptions
+from radejax.simulation.dataset import simulate_dataset
 from radejax.visualize import style
+
+ONE_FRAME = SimulationOptions(
+    train_sequences=1, test_sequences=0, frames_per_sequence=1
+)
 
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     """One simulated sequence of one frame."""
     folder = tmp_path_factory.mktemp("overlay") / "data"
-    config = default_config()
-    config.update(train_sequences=1, test_sequences=0, frames_per_sequence=1)
-    return simulate_dataset(config, folder, progress=False)
+    return simulate_dataset(ONE_FRAME, folder, progress=False)
 
 
 @pytest.fixture
@@ -143,9 +146,8 @@ def test_the_region_is_that_of_the_evaluation_and_named(
 
 
 def test_frames_with_projections_only_are_shown(tmp_path: pathlib.Path) -> None:
-    config = default_config() | {"output": "projection", "frames_per_sequence": 1}
-    config.update(train_sequences=1, test_sequences=0)
-    root = simulate_dataset(config, tmp_path / "data", progress=False)
+    options = ONE_FRAME.replace(output="projection")
+    root = simulate_dataset(options, tmp_path / "data", progress=False)
     frames = KRadar([root], visibility=None)
     (shown,) = viewer_scenes(frames, frames.grid)
     stored = np.load(frames[0].projection_path)

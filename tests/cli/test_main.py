@@ -189,6 +189,7 @@ def test_simulate_works_anywhere(
 ) -> None:
     """Without the repository's configs: the package has a small one of its own."""
     from radejax.simulation import dataset
+    from radejax.simulation.config import SimulationOptions
 
     monkeypatch.chdir(tmp_path)
     seen = []
@@ -197,7 +198,7 @@ def test_simulate_works_anywhere(
     )
     assert _run("simulate", "--out", "data", "--frames", 3).exit_code == 0
     (((config, out), _),) = seen
-    assert config == dataset.default_config() | {"frames_per_sequence": 3}
+    assert config == SimulationOptions(frames_per_sequence=3)
     assert out == pathlib.Path("data")
 
 

@@ -62,7 +62,7 @@ def test_train_takes_a_part_of_the_data(tmp_path: pathlib.Path) -> None:
         (["--config.train.batchsize=4"], "did you mean config.train.batch_size?"),
         (
             ["--config.evaluation.roi=(0,1)"],
-            "error: config.evaluation.roi is (0, 1), expected x0, x1, y0, y1, z0, z1",
+            "error: config.evaluation.roi is (0.0, 1.0), expected x0, x1, y0, y1, z0, z1",
         ),
         (["--config=radnet:official"], "did you mean radenet?"),
     ],

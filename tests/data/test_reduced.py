@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from radejax.core.config import load_module
+from radejax.config import load_module
 from radejax.core.errors import DataError, UserError
 from radejax.data import reduced
 from radejax.data.projection import project_tensor, to_log_scale

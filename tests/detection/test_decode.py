@@ -1,4 +1,3 @@
-import dataclasses
 from functools import partial
 
 import jax
@@ -8,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from radejax.core.config import base_config, load_config
-from radejax.core.errors import UserError
+from radejax.config import load_config
 from radejax.core.structures import WIDE_ROI, DetectionMaps
 from radejax.detection import decode as D
 from radejax.geometry.boxes import boxes7_from_8
@@ -381,28 +379,6 @@ def test_bfloat16_maps_and_saturated_or_missing_numbers():
         assert np.isfinite(flat.boxes).all()
         assert np.isfinite(flat.scores).all()
         assert np.asarray(flat.is_valid).any() == (value > 0)
-
-
-@pytest.mark.wrong_types
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("max_detections", 0),
-        ("score_threshold", 1.5),
-        ("score_threshold", np.nan),
-        ("nms_iou", -0.1),
-        ("roi", (0.0, 1.0)),
-        ("roi", (0.0, 1.0, 0.0, 1.0, 0.0, np.inf)),
-        ("raw_yaw", "yes"),
-    ],
-)
-def test_options_out_of_range_are_rejected(name, value):
-    with pytest.raises(UserError, match=rf"config\.decode\.{name} is .*, expected"):
-        D.DecodeOptions(**{name: value})
-
-
-def test_options_are_those_of_the_config():
-    assert dataclasses.asdict(D.DecodeOptions()) == base_config().decode.to_dict()
 
 
 @pytest.mark.wrong_types

@@ -5,8 +5,8 @@ import pathlib
 import numpy as np
 import pytest
 
+from radejax.config import load_module
 from radejax.core import files
-from radejax.core.config import load_module
 from radejax.evaluation.boxes import frame_keys, read_boxes, write_boxes
 from radejax.evaluation.files import Source
 

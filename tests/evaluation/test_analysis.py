@@ -7,7 +7,7 @@ from radejax.evaluation import analysis
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files import Source, load
 from radejax.evaluation.report import write_report
-from radejax.evaluation.results import EvaluationOptions
+from radejax.evaluation.results import ReportOptions
 
 CLASSES = ("Sedan", "Bus or Truck")
 
@@ -170,7 +170,7 @@ def test_another_unit_or_frame_is_reported(column, change, expected):
 def test_a_correction_removes_the_warning(tmp_path):
     truth, found = _scene()
     wrong = _moved(_moved(found, 6, np.rad2deg), 2, lambda z: z + 0.7)
-    frames, options = {"frame": truth["frame"]}, EvaluationOptions(plots=False)
+    frames, options = {"frame": truth["frame"]}, ReportOptions(plots=False)
     made = write_report(truth, wrong, frames, tmp_path, options)
     assert len(made.metrics["warnings"]) == made.text.count("WARNING: ") == 2
     right = load(tmp_path, Source(z_offset_m=-0.7, yaw_degrees=True), CLASSES)[1]

@@ -1,4 +1,3 @@
-import dataclasses
 import json
 import re
 
@@ -15,7 +14,7 @@ from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files import Source, evaluate_files
 from radejax.evaluation.report import write_report
 from radejax.evaluation.results import (
-    EvaluationOptions,
+    ReportOptions,
     compute_results,
     interval,
     make_set,
@@ -37,7 +36,7 @@ def settings(**options):
         "protocols": ("all_point",),
         "iou_thresholds": (0.3,),
     }
-    return EvaluationOptions(**{**defaults, "bootstrap": 50, "roi": None, **options})
+    return ReportOptions(**{**defaults, "bootstrap": 50, "roi": None, **options})
 
 
 def make(truth, found, frames):
@@ -298,7 +297,7 @@ def test_rows_by_weather_and_distance_agree_with_the_report(scene):
 
 # Runs in files ------------------------------------------------------------------------
 
-OPTIONS = EvaluationOptions(
+OPTIONS = ReportOptions(
     bootstrap=30, roi=None, plots=False, protocols=("all_point", "kradar_r40")
 )
 
@@ -334,7 +333,7 @@ def test_a_warning_names_the_score_from_which_predictions_were_stored(
     truth, found, frames = stored_scene
     kept = {k: v[found["score"] > 0.3] for k, v in found.items()}
     for name, table, min_score in (("old", kept, 0.3), ("new", found, 0.05)):
-        options = dataclasses.replace(OPTIONS, score_threshold=0.3, min_score=min_score)
+        options = OPTIONS.replace(score_threshold=0.3, min_score=min_score)
         made = write_report(truth, table, frames, tmp_path / name, options)
         thresholds = {r.protocol: r.score_threshold for r in made.results}
         assert thresholds == {"all_point": min_score, "kradar_r40": 0.3}
@@ -352,7 +351,7 @@ def test_a_warning_names_the_score_from_which_predictions_were_stored(
 
 def test_incomparable_runs_are_reported(stored_scene, tmp_path):
     kitti.write_kitti(tmp_path, *stored_scene)
-    once = dataclasses.replace(OPTIONS, bootstrap=0)
+    once = OPTIONS.replace(bootstrap=0)
     for paths, options, message in (
         ([tmp_path, tmp_path], OPTIONS, "has no column sequence"),
         ([tmp_path], OPTIONS, "at least two runs"),
@@ -367,8 +366,8 @@ def two_runs(stored, stored_scene):
     """Two folders of three seeds with reports of the settings of a run, and the first."""
     folder, _ = stored
     truth, found, frames = stored_scene
-    options = dataclasses.replace(OPTIONS, score_threshold=0.4, min_score=0.1)
-    options = dataclasses.replace(options, classes=("Sedan",))
+    changes = {"score_threshold": 0.4, "min_score": 0.1, "classes": ("Sedan",)}
+    options = OPTIONS.replace(**changes)
     for run, keep in (("a", 0.5), ("b", 0.9)):
         for seed in range(3):
             rows = np.random.default_rng(seed).random(len(found["score"])) < keep

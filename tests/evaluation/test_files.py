@@ -11,7 +11,7 @@ from radejax.cli.main import main
 from radejax.core.errors import DataError, UserError
 from radejax.evaluation import boxes, files, kitti, report
 from radejax.evaluation.files import Source
-from radejax.evaluation.results import EvaluationOptions
+from radejax.evaluation.results import ReportOptions
 
 
 def test_ground_truth_has_to_come_from_somewhere(stored):
@@ -32,7 +32,7 @@ def test_ground_truth_has_to_come_from_somewhere(stored):
 
 def test_every_way_in_gives_the_same_numbers(stored, stored_scene):
     folder, source = stored
-    options = EvaluationOptions(
+    options = ReportOptions(
         roi=None, plots=False, protocols=("all_point", "kradar_r40")
     )
 
@@ -89,12 +89,12 @@ def test_options_of_a_report_or_of_the_config_of_a_run(stored, stored_scene):
     (run / "config.json").write_text('{"classes": ["Sedan", "Tram"], "seed": 1}')
     for place in (run, run / "boxes", run / "found.json"):
         assert files.stored_options(place) == {"classes": ("Sedan", "Tram")}
-    options = EvaluationOptions(
+    options = ReportOptions(
         classes=("Sedan",), roi="wide", score_threshold=0.3, bootstrap=7, plots=False
     )
     report.write_report(*stored_scene, run / "evaluation", options)
     for place in (run, run / "evaluation"):
-        found = EvaluationOptions(**files.stored_options(place))
+        found = ReportOptions(**files.stored_options(place))
         assert found == options
     assert files.report_folders(run) == {"": run / "evaluation"}
     assert files.report_folders(run / "boxes") == {"": run / "boxes"}
@@ -132,8 +132,13 @@ def test_own_classes_need_no_option(stored, write_table):
 
 def test_exported_boxes_are_those_that_count(stored):
     folder, source = stored
-    options = EvaluationOptions(roi=(0, 15, -3, 3, -2, 6), plots=False, kitti=True)
-    options = dataclasses.replace(options, score_threshold=0.3, classes=("Sedan",))
+    options = ReportOptions(
+        roi=(0, 15, -3, 3, -2, 6),
+        plots=False,
+        kitti=True,
+        score_threshold=0.3,
+        classes=("Sedan",),
+    )
     made = files.evaluate_files(folder / "found.json", folder / "out", source, options)
     place = folder / "out" / "kitti" / "0.3" / "all"
     truth, found, _ = kitti.read_kitti(place)
@@ -144,7 +149,7 @@ def test_exported_boxes_are_those_that_count(stored):
     assert set(truth["cls"]) == set(found["cls"]) == {"Sedan"}
     assert found["score"].min() > 0.3
     # The files give the APs of the report, so that K-Radar's own script does so too.
-    whole = dataclasses.replace(options, roi=None, kitti=False)
+    whole = options.replace(roi=None, kitti=False)
     again = files.evaluate_files(place, folder / "again", Source(), whole)
     aps = {
         row.key: row.ap for row in again.results if row.protocol.startswith("kradar")

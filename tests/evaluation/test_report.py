@@ -1,5 +1,4 @@
 import csv
-import dataclasses
 import errno
 import json
 import math
@@ -15,9 +14,9 @@ from radejax.core.errors import DataError, DiskFullError
 from radejax.evaluation import evaluate, report
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOLS
-from radejax.evaluation.results import EvaluationOptions
+from radejax.evaluation.results import ReportOptions
 
-OPTIONS = EvaluationOptions(roi=None, plots=False, protocols=("all_point",))
+OPTIONS = ReportOptions(roi=None, plots=False, protocols=("all_point",))
 
 
 @pytest.fixture(scope="module")
@@ -29,9 +28,7 @@ def scene(random_scene):
 def written(scene, tmp_path_factory):
     """Report of all protocols, and its folder."""
     out = tmp_path_factory.mktemp("report")
-    options = EvaluationOptions(
-        roi=None, plots=False, bootstrap=20, label_version="v2.1"
-    )
+    options = ReportOptions(roi=None, plots=False, bootstrap=20, label_version="v2.1")
     return report.write_report(*scene, out, options, run="mine"), out
 
 
@@ -122,7 +119,7 @@ def test_invalid_sizes_are_rejected_or_kept_as_false_positives(scene, tmp_path):
     with pytest.raises(DataError, match=r"row 5: l of the box is -0.2 m"):
         report.write_report(truth, broken, frames, tmp_path, OPTIONS)
     assert not list(tmp_path.iterdir())
-    options = dataclasses.replace(OPTIONS, invalid_sizes="false_positive")
+    options = OPTIONS.replace(invalid_sizes="false_positive")
     made = report.write_report(truth, broken, frames, tmp_path, options)
     what = "predictions: size not positive, kept as false positives"
     assert made.metrics["left_out"][what] == 1
@@ -164,7 +161,7 @@ def test_frame_table_may_have_only_ids(scene, tmp_path):
 
 def test_report_without_any_boxes(tmp_path, scene):
     truth, found = ({k: v[:0] for k, v in table.items()} for table in scene[:2])
-    options = EvaluationOptions()
+    options = ReportOptions()
     made = report.write_report(truth, found, scene[2], tmp_path, options)
     assert all(row.ap_or_none is None for row in made.results)
     assert (tmp_path / "precision_recall_bev_iou30.png").is_file()
@@ -181,7 +178,7 @@ def test_curves_are_drawn_of_classes_that_occur(scene, tmp_path, monkeypatch):
         return draw(panels)
 
     monkeypatch.setattr(curves, "draw_precision_recall", watched)
-    options = dataclasses.replace(OPTIONS, plots=True)
+    options = OPTIONS.replace(plots=True)
     report.write_report(*scene, tmp_path, options)
     assert sorted(path.name for path in tmp_path.glob("*.png")) == [
         "precision_recall_3d_iou30.png",

@@ -1,5 +1,3 @@
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -7,7 +5,7 @@ from radejax.core.errors import UserError
 from radejax.evaluation.boxes import take
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.results import (
-    EvaluationOptions,
+    ReportOptions,
     compute_results,
     condition_masks,
     exclusion_counts,
@@ -19,7 +17,7 @@ from radejax.evaluation.results import (
 )
 
 CLASSES = ("Sedan", "Bus or Truck")
-OPTIONS = EvaluationOptions(
+OPTIONS = ReportOptions(
     classes=CLASSES,
     iou_thresholds=(0.3,),
     roi=None,
@@ -92,7 +90,7 @@ def test_weights_of_a_condition_give_the_condition(scene, data):
 
 
 def intervals(scene, frames, **changes):
-    options = dataclasses.replace(OPTIONS, **changes)
+    options = OPTIONS.replace(**changes)
     data = make_set(*scene[:2], frames, options)
     results = compute_results(data, frames, options)
     return {r.key[1:4]: (r.low, r.ap, r.high) for r in results}
@@ -126,7 +124,7 @@ def test_conditions_of_one_sequence_get_no_interval(scene):
 def test_excluded_boxes_and_frames_are_counted(random_scene):
     truth, found, frames = random_scene(8, num_frames=30, num_objects=90)
     data = EvaluationSet(truth, found, frames=frames, roi=(6, 20, -4, 4, -3, 3))
-    counts = exclusion_counts(data, EvaluationOptions(score_threshold=0.3))
+    counts = exclusion_counts(data, ReportOptions(score_threshold=0.3))
     kept = len(data.gt) + counts["ground truth: center outside the region of interest"]
     assert kept == len(truth["frame"])
     above, empty = data.pred.score > 0.3, ~np.isin(np.arange(30), data.gt.frame)

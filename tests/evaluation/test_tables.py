@@ -1,11 +1,10 @@
 import collections
-import dataclasses
 import re
 
 import numpy as np
 import pytest
 
-from radejax.core.config import config_file, load_config, load_module
+from radejax.config import config_file, load_config, load_module
 from radejax.core.structures import CLASSES, NARROW_ROI
 from radejax.data.kradar import KRadar
 from radejax.evaluation import report
@@ -13,8 +12,8 @@ from radejax.evaluation.boxes import tables_from_frames
 from radejax.evaluation.comparison import compare_files
 from radejax.evaluation.files import Source, evaluate_files
 from radejax.evaluation.report import PUBLISHED
-from radejax.evaluation.results import EvaluationOptions, compute_results, make_set
-from radejax.runs import checks
+from radejax.evaluation.results import ReportOptions, compute_results, make_set
+from radejax.runs.evaluate import report_options
 
 
 def printed(source, method=None, *, iou=0.3):
@@ -111,14 +110,13 @@ def test_a_published_row_has_a_config_or_is_not_trainable_here(row):
     if not is_own:
         return
     config = load_config(row.config)
-    checks.check(config)
     assert config.data.label_version == row.label_version
     # All five classes were trained, also where a table prints some of them.
     classes = ("Sedan",) if row.label_version == "v1.1" else CLASSES
-    assert tuple(config.classes) == classes
+    assert config.classes == classes
     assert {cls for _, cls, *_ in row.values} <= {*classes, "mean"}
     assert (config.model.name == "dinorade") == (row.sensors == "RC")
-    options = EvaluationOptions(**config.evaluation)
+    options = report_options(config)
     assert options.paper_protocol == row.protocol
     assert options.settings_of(row.protocol)["score_threshold"] == 0.3
     assert row.score_threshold == "0.3"
@@ -197,7 +195,7 @@ def test_means_are_means_of_their_classes(source, method):
 
 # A run in the layouts of the papers ---------------------------------------------------
 
-AS_PAPERS = EvaluationOptions(
+AS_PAPERS = ReportOptions(
     iou_thresholds=(0.3,),
     protocols=("coco101", "kradar_r40"),
     score_threshold=0.3,
@@ -219,7 +217,7 @@ def real(shared):
 
 def _tables(real, split="test", **changes):
     """Rows of Tables I, II, DinoRADE's 3, III and of other methods."""
-    options = dataclasses.replace(AS_PAPERS, **changes)
+    options = AS_PAPERS.replace(**changes)
     results = compute_results(make_set(*real, options), real[2], options)
     by_key = {row.key: row for row in results}
     built = report.paper_tables("mine", by_key, options, split)
@@ -302,7 +300,7 @@ def test_sedan_of_v1_1_is_compared_with_tables_1(real):
 def test_simulated_frames_have_no_published_row_anywhere(random_scene, tmp_path):
     truth, found, frames = random_scene(8, num_frames=30, num_objects=90)
     frames["simulated"] = np.ones(30, bool)
-    options = EvaluationOptions(roi=None, bootstrap=20, iou_thresholds=(0.3, 0.5))
+    options = ReportOptions(roi=None, bootstrap=20, iou_thresholds=(0.3, 0.5))
     made = report.write_report(truth, found, frames, tmp_path, options, run="mine")
     texts = [(tmp_path / name).read_text() for name in ("tables.md", "tables.tex")]
     for text in (*texts, made.text):

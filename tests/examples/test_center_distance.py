@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from radejax.core.config import load_module
+from radejax.config import load_module
 from radejax.evaluation.evaluation_set import EvaluationSet
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]

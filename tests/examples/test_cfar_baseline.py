@@ -12,21 +12,22 @@ from radejax.core.errors import UserError
 from radejax.data.kradar import KRadar
 from radejax.data.projection import decode
 from radejax.data.records import open_projections, preprocess
-from radejax.simulation.dataset import default_config, simulate_dataset
+from radejax.simulation.config import SimulationOptions
+from radejax.simulation.dataset import simulate_dataset
 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     """A small dataset without images, with records."""
     root = tmp_path_factory.mktemp("data")
-    config = default_config() | {
-        "train_sequences": 2,
-        "test_sequences": 1,
-        "frames_per_sequence": 8,
-        "image_width": 0,
-        "output": "projection",
-    }
-    simulate_dataset(config, root, progress=False)
+    options = SimulationOptions(
+        train_sequences=2,
+        test_sequences=1,
+        frames_per_sequence=8,
+        image_width=0,
+        output="projection",
+    )
+    simulate_dataset(options, root, progress=False)
     preprocess(KRadar(root), root / "records", num_workers=0, progress=False)
     return root
 
@@ -62,9 +63,14 @@ def test_cfar_baseline_fits_detects_and_reports(data, tmp_path, capsys):
 
 
 def test_data_without_a_training_split_are_an_error(tmp_path: pathlib.Path) -> None:
-    config = default_config() | {"train_sequences": 0, "test_sequences": 1}
-    config |= {"frames_per_sequence": 1, "image_width": 0, "output": "projection"}
-    simulate_dataset(config, tmp_path / "data", progress=False)
+    options = SimulationOptions(
+        train_sequences=0,
+        test_sequences=1,
+        frames_per_sequence=1,
+        image_width=0,
+        output="projection",
+    )
+    simulate_dataset(options, tmp_path / "data", progress=False)
     with pytest.raises(
         UserError, match="data: no training frames to fit on; --fit-data"
     ):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from radejax.core.config import load_module
+from radejax.config import load_module
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 echo_accuracy = load_module(ROOT / "examples" / "echo_accuracy.py")

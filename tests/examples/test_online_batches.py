@@ -5,25 +5,25 @@ import numpy as np
 import pytest
 from online_batches import OnlineBatches
 
-from radejax.simulation.config import default_config
+from radejax.simulation.config import SimulationOptions
 from radejax.simulation.simulator import SequenceSimulator
 
-CONFIG = default_config() | {
-    "train_sequences": 3,
-    "frames_per_sequence": 4,
-    "grid": {
+OPTIONS = SimulationOptions(
+    train_sequences=3,
+    frames_per_sequence=4,
+    grid={
         "num_doppler": 8,
         "num_range": 32,
         "num_elevation": 5,
         "num_azimuth": 24,
         "max_range_m": 62.0,
     },
-}
+)
 
 
 def batches(**kwargs):
     return OnlineBatches(
-        CONFIG, **{"batch_size": 3, "max_objects": 20, "seed": 4} | kwargs
+        OPTIONS, **{"batch_size": 3, "max_objects": 20, "seed": 4} | kwargs
     )
 
 

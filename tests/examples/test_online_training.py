@@ -10,10 +10,11 @@ from click.testing import CliRunner
 from online_training import train_online
 
 from radejax import Detector
-from radejax.core.config import load_config
+from radejax.config import load_config
 from radejax.core.errors import UserError
 from radejax.runs.evaluate import evaluate_run
-from radejax.simulation.dataset import default_config, simulate_dataset
+from radejax.simulation.config import SimulationOptions
+from radejax.simulation.dataset import simulate_dataset
 from radejax.training import distributed
 from radejax.training.checkpoints import Checkpoints
 
@@ -22,15 +23,33 @@ from .. import small_models as small
 
 def _config(num_epochs=2):
     config = load_config(str(small.CONFIGS / "quickstart.py") + ":short")
-    config.simulation.update(frames_per_sequence=2)
-    config.simulation.grid.update(
-        num_doppler=4, num_range=16, num_elevation=3, num_azimuth=16
+    return config.replace(
+        simulation={
+            "frames_per_sequence": 2,
+            "grid": {
+                "num_doppler": 4,
+                "num_range": 16,
+                "num_elevation": 3,
+                "num_azimuth": 16,
+            },
+        },
+        model={
+            "doppler_bins": 4,
+            "elevation_bins": 3,
+            "widths": (8, 8),
+            "num_groups": 4,
+            "decoder_width": 8,
+            "neck": "plain",
+            "heads": "default",
+            "pad_multiple": 4,
+        },
+        train={
+            "batch_size": 2,
+            "num_epochs": num_epochs,
+            "log_every_steps": 1,
+            "checkpoint_every_steps": 1,
+        },
     )
-    config.model.update(doppler_bins=4, elevation_bins=3, widths=(8, 8), num_groups=4)
-    config.model.update(decoder_width=8, neck="plain", heads="default", pad_multiple=4)
-    config.train.update(batch_size=2, num_epochs=num_epochs, log_every_steps=1)
-    config.train.checkpoint_every_steps = 1
-    return config
 
 
 @pytest.mark.slow
@@ -70,8 +89,9 @@ def test_training_resumes_with_identical_results(tmp_path, monkeypatch):
     data = simulate_dataset(_config().simulation, tmp_path / "data", progress=False)
     evaluate_run(whole, other={"roots": (str(data),)}, num_visualizations=0)
     assert (whole / "evaluation_data" / "metrics.json").exists()
-    finer = default_config() | {"train_sequences": 0, "test_sequences": 1}
-    finer |= {"frames_per_sequence": 1, "output": "projection"}
+    finer = SimulationOptions(
+        train_sequences=0, test_sequences=1, frames_per_sequence=1, output="projection"
+    )
     data = simulate_dataset(finer, tmp_path / "finer", progress=False)
     with pytest.raises(
         UserError, match=r"16 x 64 .*expected 4 x 16 .*model was trained"
@@ -85,13 +105,16 @@ def test_training_resumes_with_identical_results(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"classes": ("Sedan",)}, "classes must be"),
-        ({"simulation": {"scenes": "labels.zip"}}, "scenes must be procedural"),
+        ({"classes": ("Sedan",), "model": {"num_classes": 1}}, "classes must be"),
+        (
+            {"simulation": {"scenes": "labels.zip", "vru_density_scale": 1.0}},
+            "scenes must be procedural",
+        ),
+        ({"simulation": None}, "no `simulation` section"),
     ],
 )
 def test_unsupported_configs_are_errors(changes, message, tmp_path):
-    config = _config()
-    config.update(changes)
+    config = _config().replace(**changes)
     with pytest.raises(UserError, match=message):
         train_online(config, tmp_path / "run")
     assert not (tmp_path / "run").exists()

@@ -10,10 +10,10 @@ import pytest
 from click.testing import CliRunner
 from own_radar import GRID, OwnRadar
 
+from radejax.config import check_bins
 from radejax.core.errors import DataError, UserError
 from radejax.data.projection import LOG_OFFSET_DB, LOG_SCALE_DB
 from radejax.data.records import preprocess
-from radejax.runs import checks
 
 # 10 m ahead of the radar and 2 m to the left of its boresight, with its heading.
 COS, SIN = np.cos(own_radar.MOUNTING_YAW_RAD), np.sin(own_radar.MOUNTING_YAW_RAD)
@@ -83,8 +83,8 @@ def test_a_wrong_line_is_named(tmp_path: pathlib.Path, power: np.ndarray) -> Non
         OwnRadar([write(tmp_path, lines, power)], classes=("car",))
 
 
-def test_the_config_is_complete() -> None:
-    checks.check(own_radar.get_config())
+def test_the_config_fits_the_radar() -> None:
+    check_bins(own_radar.get_config().model, GRID, "the radar")
 
 
 @pytest.mark.slow

@@ -9,9 +9,10 @@ import pytest
 from click.testing import CliRunner
 
 from radejax import models
-from radejax.core.config import load_config, plain
+from radejax.config import load_config
 from radejax.core.structures import CLASSES
 from radejax.models.image import ResNetTrunk
+from radejax.models.vit import ViT
 from radejax.weights.image_backbone import load_image_backbone
 
 from .. import small_models as small
@@ -19,17 +20,23 @@ from .. import small_models as small
 
 def _config(word="pretrained"):
     config = load_config(str(small.CONFIGS / f"quickstart_fusion.py:{word}"))
-    config.simulation.update(image_width=128, image_height=32, cover_lens=False)
-    config.model.image.update(
-        size=(32, 128), hidden_size=16, num_layers=1, num_heads=2, mlp_dim=16
+    image = {
+        "size": (32, 128),
+        "hidden_size": 16,
+        "num_layers": 1,
+        "num_heads": 2,
+        "mlp_dim": 16,
+        "resnet_width": 4,
+    }
+    return config.replace(
+        simulation={"image_width": 128, "image_height": 32, "cover_lens": False},
+        model={"image": image},
     )
-    config.model.image.resnet_width = 4
-    return config
 
 
 def _drawn(count, share=0.0, **fields):
-    simulation = plain(_config().simulation) | fields
-    return pretraining.draw(simulation, 16, count, 7, share)
+    options = _config().simulation.replace(**fields)
+    return pretraining.draw(options, 16, count, 7, share)
 
 
 def test_patches_show_the_classes_that_are_drawn():
@@ -80,14 +87,16 @@ def test_it_learns_and_what_it_writes_is_a_frozen_backbone(
     losses = [float(line.split()[3][:-1]) for line in result.output.splitlines()[1:13]]
     assert losses[-1] < 0.6 * losses[0]
     (line,) = (row for row in result.output.splitlines() if "Sedan" in row)
-    shown = pretraining.draw(plain(_config().simulation), 16, 32, pretraining.SEEDS[1])
+    shown = pretraining.draw(_config().simulation, 16, 32, pretraining.SEEDS[1])
     chance = (shown.pixels[..., 0] >= pretraining.PIXELS_SHOWN).mean()
     assert float(line.split("Sedan ")[1].split(",")[0]) > chance + 0.2
-    model = models.build(_config(word).model)
-    assert model.freeze
+    options = _config(word).model
+    model, image = models.build(options), options.image
+    assert image.freeze
     file = {"pretrained": "", "resnet50": pretraining.RESNET_FILE}[word]
     params = load_image_backbone(tmp_path / "backbone" / file, model)["params"]
-    backbone = model.vit or ResNetTrunk(model.resnet_width)
+    trunk = ResNetTrunk(image.resnet_width)
+    backbone = ViT(image) if image.kind == "vit" else trunk
     shapes = jax.eval_shape(backbone.init, jax.random.key(0), np.zeros((1, 32, 128, 3)))
     assert jax.tree.map(np.shape, params["image_backbone"]) == jax.tree.map(
         lambda leaf: leaf.shape, shapes["params"]

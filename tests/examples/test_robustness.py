@@ -8,8 +8,8 @@ import pytest
 import robustness
 from click.testing import CliRunner
 
-from radejax.core.config import load_config
-from radejax.simulation.config import PRESETS, SimulationConfig
+from radejax.config import load_config
+from radejax.simulation.config import PRESETS, RadarOptions
 from radejax.simulation.radar.tensor import DRAWN
 
 
@@ -17,7 +17,7 @@ def test_every_radar_has_one_effect_at_the_edge_of_its_range() -> None:
     found = dict(robustness.radars())
     assert len(found) == 2 + 2 * len(DRAWN)
     for name, fields in found.items():
-        parameters = SimulationConfig(radar=fields).make_parameters()
+        parameters = RadarOptions(**fields).make_parameters()
         drawn = {field for field, _, _ in parameters.ranges}
         if name == "ideal":
             assert not drawn
@@ -46,7 +46,7 @@ def test_table_has_the_share_that_each_radar_loses(
         robustness, "load_model", lambda run: types.SimpleNamespace(config=config)
     )
     monkeypatch.setattr(
-        robustness, "simulate_dataset", lambda config, root: simulated.append(config)
+        robustness, "simulate_dataset", lambda options, root: simulated.append(options)
     )
     monkeypatch.setattr(robustness, "evaluate_run", evaluate)
     run = tmp_path / "quickstart"
@@ -57,8 +57,7 @@ def test_table_has_the_share_that_each_radar_loses(
     assert "| realistic | 40.0 (+0%) |" in " ".join(done.output.split())
     assert "| noise_db 108 | 30.0 (+25%) |" in " ".join(done.output.split())
     assert len(simulated) == 2 + 2 * len(DRAWN)
-    for fields in simulated:
-        checked = SimulationConfig.from_mapping(fields)
-        assert checked.make_parameters().azimuth_elements == 40.0
-        assert len({checked.test_sequences, checked.train_sequences} ^ {0, 7}) == 0
-        assert checked.vru_density_scale == 1.0
+    for options in simulated:
+        assert options.make_parameters().azimuth_elements == 40.0
+        assert (options.train_sequences, options.test_sequences) == (0, 7)
+        assert options.vru_density_scale == 1.0

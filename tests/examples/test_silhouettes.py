@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from radejax.core.config import load_module
-from radejax.core.structures import CLASSES
+from radejax.config import load_module
 from radejax.evaluation.comparison import Comparison
 from radejax.evaluation.report import write_report
-from radejax.evaluation.results import EvaluationOptions
+from radejax.evaluation.results import ReportOptions
 from radejax.runs import experiment
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
@@ -33,7 +32,7 @@ def _run(score_of_camera: float, seen: list[Any]) -> Any:
         frames = {"frame": frame, "sequence": frame, "simulated": np.full(40, True)}
         write_report(
             truth, found, frames, workdir / "evaluation",
-            EvaluationOptions(CLASSES, (0.3,), ("all_point",), plots=False),
+            ReportOptions(iou_thresholds=(0.3,), protocols=("all_point",), plots=False),
         )  # fmt: skip
         return workdir
 

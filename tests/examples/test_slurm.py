@@ -10,7 +10,7 @@ import time
 import pytest
 
 from radejax.cli.train import train
-from radejax.core.config import load_config
+from radejax.config import load_config
 
 SCRIPT = pathlib.Path(__file__).resolve().parents[2] / "examples" / "slurm.sh"
 DIRECTIVES = dict(

@@ -41,7 +41,7 @@ SMALL = {
 
 VARIANTS = {
     "model": {},
-    "base": {"cbam": None, "neck": "plain", "heads": "default"},
+    "base": {"cbam": "off", "neck": "plain", "heads": "default"},
     "stem": {"input_stem": True},
     "expand": {"decoder_width": 32},
     "paper": {"cbam": "paper"},

@@ -14,7 +14,7 @@ import sys
 
 import numpy as np
 
-from radejax.core.config import load_module
+from radejax.config import load_module
 
 
 def main(shared: pathlib.Path) -> None:

@@ -7,8 +7,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from radejax import models
+from radejax.config import Config
 from radejax.core import files
-from radejax.core.config import base_config
 from radejax.core.errors import UserError
 from radejax.data.cameras import CameraOptions
 from radejax.evaluation.files import Source
@@ -20,7 +21,9 @@ from radejax.inference.detect_files import (
     key_of,
 )
 from radejax.inference.saved import load_model, save_model
-from radejax.simulation.dataset import default_config, simulate_dataset
+from radejax.models.options import DinoRadeOptions, ImageOptions
+from radejax.simulation.config import SimulationOptions
+from radejax.simulation.dataset import simulate_dataset
 
 from .. import small_models as small
 
@@ -163,14 +166,15 @@ def test_two_frames_of_one_name_are_rejected(tmp_path):
 
 def test_images_of_simulated_folders_are_found(tmp_path):
     """Their labels are in `info_label_v2_1`."""
-    config = default_config() | {"output": "projection", "frames_per_sequence": 1}
-    config.update(train_sequences=1, test_sequences=0)
-    root = simulate_dataset(config, tmp_path / "data", progress=False)
+    options = SimulationOptions(
+        output="projection", train_sequences=1, test_sequences=0, frames_per_sequence=1
+    )
+    root = simulate_dataset(options, tmp_path / "data", progress=False)
     (path,) = find_frames([root])
     detector = SimpleNamespace(
-        model=SimpleNamespace(image_size=(180, 320)),
+        model=models.build(DinoRadeOptions(image=ImageOptions(size=(180, 320)))),
         camera_options=CameraOptions(),
-        saved=SimpleNamespace(config=base_config()),
+        saved=SimpleNamespace(config=Config()),
     )
     ((found, (image, camera)),) = front_images([path], detector).items()
     assert found == path.absolute()

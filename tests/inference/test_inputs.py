@@ -147,7 +147,9 @@ def test_a_radar_model_takes_no_image():
 
 def test_the_shift_and_projection_of_a_config_are_used():
     calibration = small.calibration(distortion=(0.1, 0, 0, 0, 0))
-    options = CameraOptions("pinhole", (-2.08, -0.13, 0.9))
+    options = CameraOptions(
+        projection="pinhole", radar_from_lidar_m=(-2.08, -0.13, 0.9)
+    )
     model = small.detector("camera").model
     _, camera, _ = camera_batch(small.images(1), calibration, 1, model, options)
     assert not camera.distortion.any()

@@ -7,14 +7,17 @@ import numpy as np
 import pytest
 
 from radejax import models
-from radejax.core.config import base_config
+from radejax.config import Config
+from radejax.data.options import DataOptions
 from radejax.data.records import preprocess
 from radejax.inference.detector import Detector
 from radejax.inference.predict import predict_dataset
 from radejax.inference.saved import SavedModel
+from radejax.models.options import RadeNetOptions
 from radejax.runs.data import Data
 from radejax.runs.evaluate import Evaluation
-from radejax.simulation.dataset import default_config, simulate_dataset
+from radejax.simulation.config import SimulationOptions
+from radejax.simulation.dataset import simulate_dataset
 from radejax.training import distributed
 
 from ..small_models import drawn
@@ -24,27 +27,28 @@ from ..small_models import drawn
 def setup(tmp_path_factory):
     """Five simulated frames, and a detector that was never trained."""
     folder = tmp_path_factory.mktemp("predict")
-    simulation = default_config()
-    simulation.update(train_sequences=0, test_sequences=1, frames_per_sequence=5)
-    simulation["grid"].update(
-        num_doppler=4, num_range=32, num_elevation=3, num_azimuth=28
-    )
+    grid = {"num_doppler": 4, "num_range": 32, "num_elevation": 3, "num_azimuth": 28}
+    simulation = SimulationOptions(
+        train_sequences=0, test_sequences=1, frames_per_sequence=5
+    ).replace(grid=grid)
     root = simulate_dataset(simulation, folder / "data", progress=False)
-    config = base_config()
-    config.model.update(
-        doppler_bins=simulation["grid"]["num_doppler"],
-        elevation_bins=simulation["grid"]["num_elevation"],
-        widths=(8, 8),
-        decoder_width=8,
-        num_groups=4,
-        cbam="off",
-        neck="plain",
-        heads="default",
+    config = Config(
+        model=RadeNetOptions(
+            doppler_bins=4,
+            elevation_bins=3,
+            widths=(8, 8),
+            decoder_width=8,
+            num_groups=4,
+            cbam="off",
+            neck="plain",
+            heads="default",
+        ),
+        data=DataOptions(roots=(str(root),), records=str(folder / "records")),
+    ).replace(
+        evaluation={"score_threshold": 0.45, "batch_size": 3},
+        logging={"num_visualizations": 1},
     )
-    config.evaluation.update(score_threshold=0.45, batch_size=3)
-    config.logging.num_visualizations = 1
     model = models.build(config.model)
-    config.data.update(roots=(str(root),), records=str(folder / "records"))
     data = Data(config, model)
     preprocess(data.frames, folder / "records", num_workers=0, progress=False)
     records = data.records

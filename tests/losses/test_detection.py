@@ -1,3 +1,4 @@
+import json
 from functools import partial
 
 import jax
@@ -6,7 +7,6 @@ import numpy as np
 import optax
 import pytest
 
-from radejax.core.errors import UserError
 from radejax.core.structures import Batch, DetectionMaps
 from radejax.detection.decode import DecodeOptions
 from radejax.geometry.radar_grid import RadarGrid
@@ -69,10 +69,11 @@ def case(request, cases):
     maps, heatmap = reference_maps(int(want["stream"]), len(want["boxes"]))
     sigma = {"sigma_mode": str(want["sigma_mode"])}
     sigma["sigma_bins"] = float(want["sigma_cells"])
-    options = {f"heatmap_{name}": value for name, value in sigma.items()}
+    changes = {f"heatmap_{name}": value for name, value in sigma.items()}
+    options = LossOptions(gwd_transform="none", **changes)
 
     def loss(maps):
-        return detection_loss(maps, batch, STRETCHED, gwd_transform="none", **options)
+        return detection_loss(maps, batch, STRETCHED, options)
 
     (total, parts), grads = jax.jit(jax.value_and_grad(loss, has_aux=True))(maps)
     target = gaussian_heatmap(
@@ -187,21 +188,19 @@ def small_scene(rng, counts=(0, 1, 3), rows=4):
     return maps, batch_of(boxes, classes, is_valid)
 
 
-@partial(jax.jit, static_argnames="options")
-def _loss_and_grad(maps, batch, options):
-    chosen = {k: dict(v) if k == "weights" else v for k, v in options}
+@partial(jax.jit, static_argnames=("options", "decoding"))
+def _loss_and_grad(maps, batch, options, decoding):
+    chosen = LossOptions(**json.loads(options))
 
     def loss(maps):
-        return detection_loss(maps, batch, GRID, **chosen)
+        return detection_loss(maps, batch, GRID, chosen, decoding)
 
     return jax.value_and_grad(loss, has_aux=True)(maps)
 
 
-def loss_and_grad(maps, batch, **options):
+def loss_and_grad(maps, batch, decoding=None, **options):
     """Compiled once per shape and set of options, not once per test."""
-    if "weights" in options:
-        options["weights"] = tuple(options["weights"].items())
-    return _loss_and_grad(maps, batch, tuple(sorted(options.items())))
+    return _loss_and_grad(maps, batch, json.dumps(options), decoding)
 
 
 def naive_regression(maps, batch, transform="sqrt"):
@@ -383,29 +382,9 @@ def test_nms_matching_chooses_boxes_as_decoding_does(changes, num_matched):
     batch = batch_of(boxes, np.array([[0, 1]]), np.ones((1, 2), bool))
     decoding = DecodeOptions(score_threshold=0.5, **changes)
     maps = DetectionMaps(jnp.asarray(logits), jnp.asarray(params))
-    _, parts = detection_loss(maps, batch, GRID, assignment="nms", decoding=decoding)
+    options = LossOptions(assignment="nms")
+    _, parts = detection_loss(maps, batch, GRID, options, decoding)
     assert int(parts["num_matched"]) == num_matched
-
-
-@pytest.mark.wrong_types
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("assignment", "nearest"),
-        ("heatmap_sigma_mode", "round"),
-        ("heatmap_sigma_bins", 0.0),
-        ("gwd_transform", "cube"),
-        ("gwd_tau", np.nan),
-        ("weights", {"focal": 1.0, "giou": 1.0}),
-        ("weights", {"focal": -1.0}),
-        ("weights", {"focal": np.nan}),
-        ("weights", {"focal": 0.0}),
-        ("weights", {}),
-    ],
-)
-def test_options_out_of_range_are_rejected(name, value):
-    with pytest.raises(UserError, match=rf"config\.loss\.{name} is .*, expected"):
-        LossOptions(**{name: value})
 
 
 def test_wrong_shapes_are_rejected():
@@ -433,7 +412,7 @@ def test_matching_after_nms_begins_where_boxes_have_a_size():
     @jax.jit
     def step(maps, state):
         def loss(maps):
-            return detection_loss(maps, batch, grid, assignment="nms")
+            return detection_loss(maps, batch, grid, LossOptions(assignment="nms"))
 
         (_, parts), grads = jax.value_and_grad(loss, has_aux=True)(maps)
         updates, state = optimizer.update(grads, state)

@@ -44,7 +44,7 @@ def test_any_number_of_levels(widths):
 def test_skips_are_joined_after_the_upsampled_map():
     # decoder_1 reads [upsampled 32, skip 32]: zeroing its first 32 input channels must
     # hide the bottleneck and leave the skip.
-    backbone = Backbone(8, (16, 32), decoder_width=16, num_groups=8, cbam=None)
+    backbone = Backbone(8, (16, 32), decoder_width=16, num_groups=8, cbam="off")
     x = jax.random.normal(jax.random.key(1), (1, 8, 8, 13))
     variables = backbone.init(jax.random.key(0), x)
     decoder = variables["params"]["decoder_1"]

@@ -3,9 +3,10 @@
 import pytest
 
 from radejax import models
-from radejax.core.config import base_config
 from radejax.core.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
+from radejax.models.options import DinoRadeOptions, RadeNetOptions
+from radejax.models.radenet import RadeNet
 
 from .. import small_models as small
 
@@ -13,12 +14,13 @@ GRID = RadarGrid.reduced(num_doppler=2, num_range=13, num_elevation=2, num_azimu
 
 
 def test_map_grid_follows_padding_and_cropping() -> None:
-    model = models.build(base_config().model)
-    padded = models.map_grid(GRID, model.clone(crop_output=False), "true")
+    model = models.build(RadeNetOptions())
+    whole = models.build(RadeNetOptions(crop_output=False))
+    padded = models.map_grid(GRID, whole, "true")
     assert (padded.num_range, padded.num_azimuth) == (16, 16)
-    cropped = models.map_grid(GRID, model.clone(crop_output=True), "true")
+    cropped = models.map_grid(GRID, model, "true")
     assert cropped == GRID
-    stretched = models.map_grid(GRID, model.clone(crop_output=True), "stretched")
+    stretched = models.map_grid(GRID, model, "stretched")
     assert stretched.num_azimuth == 11
     assert stretched.azimuth_step_rad < GRID.azimuth_step_rad
     assert not models.has_camera(model)
@@ -42,36 +44,40 @@ CHOICES = {
 
 @pytest.mark.parametrize("field", CHOICES)
 def test_an_unknown_name_is_rejected_with_those_that_there_are(field: str) -> None:
-    config = small.camera_config().model.to_dict()
-    section, _, name = field.rpartition(".")
-    (config[section] if section else config)[name] = "wide"
+    config = small.camera_config()
     words = rf"config.model.{field} is 'wide'.*'{CHOICES[field]}'"
     with pytest.raises(UserError, match=words):
-        models.build(config)
+        config.with_fields({f"model.{field}": "wide"})
 
 
-def test_a_module_made_by_hand_is_checked() -> None:
-    model = models.build(small.radar_config().model)
-    with pytest.raises(UserError, match=r"model.neck is 'wide', expected .*'plain'"):
-        model.clone(neck="wide")
+def test_options_of_another_model_are_rejected() -> None:
+    with pytest.raises(UserError, match=r"'RadeNetOptions', expected DinoRadeOptions"):
+        models.build(RadeNetOptions(name="dinorade"))
+    assert models.options_class("radenet") is RadeNetOptions
+    assert models.options_class("dinorade") is DinoRadeOptions
+    assert models.options_class(f"{__name__}:Own") is OwnOptions
+
+
+class OwnOptions(RadeNetOptions):
+    exponent: float = 2.0
+
+
+class Own(RadeNet):
+    options: OwnOptions
 
 
 def test_an_axis_may_have_no_channels_but_not_both() -> None:
-    config = small.radar_config().model
-    config.elevation_bins = 0
-    assert models.build(config).elevation_bins == 0
-    config.doppler_bins = 0
+    options = small.radar_config().model
+    assert options.replace(elevation_bins=0).doppler_bins == 2
+    assert options.replace(doppler_bins=0).elevation_bins == 3
     with pytest.raises(UserError, match=r"elevation_bins is 0, expected above 0 if"):
-        models.build(config)
-    config.update(doppler_bins=-1, elevation_bins=3)
+        options.replace(elevation_bins=0, doppler_bins=0)
     with pytest.raises(UserError, match=r"doppler_bins is -1, expected an integer"):
-        models.build(config)
+        options.replace(doppler_bins=-1)
 
 
 def test_elevation_weights_need_elevation_channels() -> None:
-    config = small.camera_config().model
-    config.elevation_bins = 0
+    options = small.camera_config().model
     with pytest.raises(UserError, match=r"weighting is 'mlp', expected 'off' without"):
-        models.build(config)
-    config.fusion.weighting = "off"
-    assert models.build(config).elevation_bins == 0
+        options.replace(elevation_bins=0)
+    options.replace(elevation_bins=0, fusion={"weighting": "off"})

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.core.config import load_module
+from radejax.config import load_module
 from radejax.models.deformable_attention import DeformableAttention, lifted_attention
 
 from .plain_attention import plain_attention, plain_samples

@@ -1,8 +1,6 @@
 """Tests of radejax.models.dinorade."""
 
-import dataclasses
 import functools
-import pathlib
 
 import chex
 import jax
@@ -10,12 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.core.config import load_module
+from radejax.config import load_config
 from radejax.core.errors import UserError
 from radejax.data.projection import stack_frames
 from radejax.geometry.camera import stack_cameras
 from radejax.models import build, lifting
 from radejax.models.lifting import ReferencePoints
+from radejax.models.options import OFFICIAL_DINORADE, RadeNetOptions
 from radejax.models.radenet import RadeNet
 
 from .. import small_models
@@ -26,14 +25,16 @@ B, R, A, SIZE = 2, 6, 7, small_models.IMAGE_SIZE
 
 def small(**changes):
     """A model of a few thousand parameters; `changes` by dotted name."""
-    config = small_models.camera_config().model
-    config.update(num_classes=2, crop_output=True)
-    config.query_grid.update(range_m=(2.0, 5.0), azimuth_deg=(-45.0, 15.0))
-    config = config.to_dict()
-    for name, value in changes.items():
-        *path, last = name.split(".")
-        functools.reduce(lambda node, key: node[key], path, config)[last] = value
-    return build(config)
+    options = small_models.camera_config().model.replace(
+        num_classes=2, query_grid={"range_m": (2.0, 5.0), "azimuth_deg": (-45.0, 15.0)}
+    )
+    return build(options.with_fields(changes))
+
+
+def references(model, camera, num_range=8):
+    options = model.options
+    bins = num_range, 8, options.fusion.num_elevation
+    return lifting.reference_points(camera, options.query_grid, *bins)
 
 
 def batch(*, valid=(True, True), yaws=(90.0, 80.0)):
@@ -75,8 +76,10 @@ def test_shapes_and_parts():
 def test_radar_parts_have_the_names_of_radenet():
     model, variables = model_and_variables()
     assert isinstance(model, RadeNet)
-    fields = {f.name: getattr(model, f.name) for f in dataclasses.fields(RadeNet)}
-    radar = RadeNet(**fields | {"parent": None})
+    fields = {
+        name: getattr(model.options, name) for name in RadeNetOptions.model_fields
+    }
+    radar = RadeNet(RadeNetOptions(**fields))
     shapes = jax.eval_shape(radar.init, jax.random.key(0), batch()[0])["params"]
     ours = {k: variables["params"][k] for k in ("backbone", "neck", "heads")}
     chex.assert_trees_all_equal_shapes(ours, shapes)
@@ -97,7 +100,7 @@ def test_elevation_weights_are_those_of_the_last_frame():
         return weights, found["backbone"]["__call__"][0]
 
     def weighting(*frames):
-        return apply(stack_frames(frames, model.doppler_bins))
+        return apply(stack_frames(frames, model.options.doppler_bins))
 
     a, b, c = small_models.projections(3)
     weights, features = weighting(a, b)
@@ -147,8 +150,7 @@ def test_a_query_samples_the_same_place_of_an_image_that_is_resized():
     np.testing.assert_allclose(scaled, pixels * 28 / 32, rtol=1e-12)
     # Reference points are fractions of the image, so that those of both cameras are equal.
     reference, other = (
-        lifting.reference_points(one.camera(), model.query_grid, 8, 8)
-        for one in (own, own.resized(42, 28))
+        references(model, one.camera()) for one in (own, own.resized(42, 28))
     )
     chex.assert_trees_all_close(reference, other, atol=1e-7)
     assert 0.05 < reference.is_valid.mean() < 0.95
@@ -168,7 +170,7 @@ def test_a_query_samples_the_same_place_of_an_image_that_is_resized():
 def test_reference_points_computed_before_give_the_same_prediction():
     model, variables = model_and_variables()
     projection, image, camera = batch(yaws=(90.0, 90.0))
-    reference = lifting.reference_points(calibration().camera(), model.query_grid, 8, 8)
+    reference = references(model, calibration().camera())
     assert 0.05 < reference.is_valid.mean() < 0.95
     chex.assert_trees_all_close(
         applied()(variables, projection, image, reference),
@@ -261,7 +263,7 @@ def test_half_precision():
     ],
 )
 def test_parameters_at_full_size(variant, trained, frozen):
-    model = build(config_module().get_config(variant).model)
+    model = build(load_config(f"dinorade:{variant}").model)
     inputs = [jnp.zeros((1, 256, 107, 101))]
     if variant != "r":
         inputs.append(jnp.zeros((1, 720, 1280, 3), jnp.uint8))
@@ -277,25 +279,22 @@ def test_parameters_at_full_size(variant, trained, frozen):
     assert frozen[0] <= inside <= frozen[1]
 
 
-def config_module():
-    return load_module(pathlib.Path(__file__).parents[2] / "configs" / "dinorade.py")
-
-
 def test_variants_differ_where_their_names_say():
-    get_config = config_module().get_config
-    assert get_config().model.fusion.out_of_view == "drop"
-    assert get_config("rc").model.fusion.weighting == "off"
-    assert not get_config("official,rcw_resnet50").model.image.standardize
-    assert get_config("rcw,sedan").model.num_classes == 1
+    assert load_config("dinorade").model.fusion.out_of_view == "drop"
+    assert load_config("dinorade:rc").model.fusion.weighting == "off"
+    model = load_config("dinorade:official,rcw_resnet50").model
+    assert not model.image.standardize
+    assert load_config("dinorade:rcw,sedan").model.num_classes == 1
+    assert load_config("dinorade:official").model == OFFICIAL_DINORADE
     with pytest.raises(UserError, match="unknown config option 'rcx'"):
-        get_config("rcx")
+        load_config("dinorade:rcx")
 
 
 @pytest.mark.wrong_types
 def test_images_of_another_size_are_rejected():
     model, variables = model_and_variables()
     projection, image, camera = batch()
-    short = lifting.reference_points(calibration().camera(), model.query_grid, 4, 8)
+    short = references(model, calibration().camera(), 4)
     for message, arguments in (
         (r"\(2, 32, 32, 3\), expected \('B', 32, 48", (image[:, :, :32], camera)),
         ("camera is given without image", (None, camera)),
@@ -310,7 +309,10 @@ def test_images_of_another_size_are_rejected():
     ("changes", "message"),
     [
         ({"fusion.depth": 3}, r"config.model.fusion.depth is not a field"),
-        ({"query_grid": {}}, r"config.model.query_grid.azimuth_deg is missing"),
+        (
+            {"query_grid.range_m": (1.0,)},
+            r"config.model.query_grid.range_m is \(1.0,\)",
+        ),
         ({"image.size": (8, 48)}, r"image.size is \(8, 48\), .* at least 16 pixels"),
         (
             {"image.kind": "resnet50", "image.size": (30, 48)},

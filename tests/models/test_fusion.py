@@ -8,12 +8,18 @@ import pytest
 
 from radejax.models.fusion import Fusion
 from radejax.models.lifting import ReferencePoints
+from radejax.models.options import FusionOptions
 
 from .plain_attention import plain_attention
 
 B, R, A, C, E, D, H, W = 2, 4, 3, 8, 3, 5, 6, 7
-SMALL = {"num_heads": 2, "num_points": 3, "num_elevation": E, "num_groups": 4}
-SMALL |= {"necks": False, "chunk_size": 5}
+SMALL = FusionOptions(
+    num_heads=2, num_points=3, num_elevation=E, necks=False, chunk_size=5
+)
+
+
+def fusion(**changes):
+    return Fusion(SMALL.replace(**changes), num_groups=4)
 
 
 def inputs(seed=0, batch_geometry=True):
@@ -45,7 +51,7 @@ def by_the_formulas(module, variables, radar, elevation, camera, reference):
     radar, elevation, camera = map(np.asarray, (radar, elevation, camera))
     dense = lambda x, p: x @ p["kernel"] + p["bias"]  # noqa: E731
     weights = np.ones((B, R, A, E))
-    if module.weighting == "mlp":
+    if module.options.weighting == "mlp":
         hidden = np.maximum(dense(elevation, params["weighting"]["hidden"]), 0)
         weights = np.exp(dense(hidden, params["weighting"]["out"]))
         weights /= weights.sum(-1, keepdims=True)
@@ -58,10 +64,10 @@ def by_the_formulas(module, variables, radar, elevation, camera, reference):
         jnp.asarray(points.reshape(B, -1, 1, 2)),
         jnp.asarray(camera.reshape(B, H * W, C)),
         [(H, W)],
-        (module.num_heads, module.num_points),
+        (module.options.num_heads, module.options.num_points),
     )
     attended = np.asarray(attended).reshape(B, R, A, E, C)
-    if module.out_of_view == "official":
+    if module.options.out_of_view == "official":
         seen, has_camera = attended.mean(3), np.ones((B, R, A, 1), bool)
     else:
         count = is_valid.sum(-1)[..., None]
@@ -70,7 +76,7 @@ def by_the_formulas(module, variables, radar, elevation, camera, reference):
     joined = np.concatenate([radar, seen], -1)
     hidden = np.maximum(dense(joined, params["gate_hidden"]), 0)
     gate = 1 / (1 + np.exp(-dense(hidden, params["gate_out"])))
-    if module.gate == "channel":
+    if module.options.gate == "channel":
         fused = gate * radar + (1 - gate) * seen
     else:
         fused = gate * seen + (1 - gate) * radar
@@ -86,7 +92,7 @@ def by_the_formulas(module, variables, radar, elevation, camera, reference):
     ],
 )
 def test_fusion_follows_the_equations(weighting, gate, out_of_view, batch_geometry):
-    module = Fusion(**SMALL, weighting=weighting, gate=gate, out_of_view=out_of_view)
+    module = fusion(weighting=weighting, gate=gate, out_of_view=out_of_view)
     args = inputs(batch_geometry=batch_geometry)
     variables = variables_of(module, args)
     fused = jax.jit(module.apply)(variables, *args)
@@ -98,7 +104,7 @@ def test_fusion_follows_the_equations(weighting, gate, out_of_view, batch_geomet
 
 
 def test_bins_that_see_nothing_keep_their_radar_feature():
-    module = Fusion(**SMALL)
+    module = fusion()
     args = inputs()
     fused = jax.jit(module.apply)(variables_of(module, args), *args)
     np.testing.assert_array_equal(fused[:, 1, 1], args[0][:, 1, 1])
@@ -107,7 +113,7 @@ def test_bins_that_see_nothing_keep_their_radar_feature():
 
 @pytest.mark.parametrize("necks", [False, True])
 def test_a_missing_image_leaves_the_radar_alone(necks):
-    module = Fusion(**(SMALL | {"necks": necks}), out_of_view="official")
+    module = fusion(necks=necks, out_of_view="official")
     radar, elevation, camera, reference = inputs()
     variables = variables_of(module, (radar, elevation, camera, reference))
     reference = reference.replace(has_image=np.array([True, False]))
@@ -126,7 +132,7 @@ def test_a_missing_image_leaves_the_radar_alone(necks):
 
 
 def test_dropout_drops_in_training_only():
-    module = Fusion(**SMALL, dropout=0.5)
+    module = fusion(dropout=0.5)
     args = inputs()
     variables = variables_of(module, args)
     plain = module.apply(variables, *args)

@@ -1,7 +1,5 @@
 """Tests of radejax.models.lifting."""
 
-import dataclasses
-
 import chex
 import jax
 import jax.numpy as jnp
@@ -11,11 +9,14 @@ import pytest
 from radejax.geometry.camera import Camera, CameraCalibration, stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models import lifting
-from radejax.models.lifting import LiftingAxes, WeightingNetwork
+from radejax.models.lifting import WeightingNetwork
+from radejax.models.options import QueryGridOptions
 
 from .. import small_models as small
 
-AXES = LiftingAxes((1.0, 4.0), (-40.0, 20.0), (-10.0, 10.0), 2)
+AXES = QueryGridOptions(
+    range_m=(1.0, 4.0), azimuth_deg=(-40.0, 20.0), elevation_deg=(-10.0, 10.0)
+)
 
 
 def official_calibration(golden) -> CameraCalibration:
@@ -39,7 +40,7 @@ def ahead(**fields) -> CameraCalibration:
 
 
 def test_centers_by_hand():
-    centers = AXES.centers_ego(2, 3)
+    centers = AXES.centers_ego(2, 3, 2)
     chex.assert_shape(centers, (2, 3, 2, 3))
     # Range 5, azimuth 0, elevation -5 and +5 degrees.
     low = [5 * np.cos(np.deg2rad(5)), 0, -5 * np.sin(np.deg2rad(5))]
@@ -51,15 +52,15 @@ def test_centers_by_hand():
 
 def test_axes_follow_the_grid_and_may_point_down():
     grid = RadarGrid.kradar()
-    axes = LiftingAxes.of_grid(grid)
-    centers = axes.centers_ego(256, 112)
+    axes = QueryGridOptions.of_grid(grid)
+    centers = axes.centers_ego(256, 112, 10)
     flat = np.hypot(centers[..., 0], centers[..., 1]) / np.cos(np.deg2rad(16.2))
     np.testing.assert_allclose(flat[:, 5, 0], grid.range_m, atol=1e-9)
     azimuth = -np.arctan2(centers[9, :107, 3, 1], centers[9, :107, 3, 0])
     np.testing.assert_allclose(azimuth, grid.azimuth_rad, atol=1e-12)
-    down = LiftingAxes(axes.range_m, axes.azimuth_deg, (18.0, -18.0), 10)
+    down = axes.replace(elevation_deg=(18.0, -18.0))
     np.testing.assert_allclose(
-        down.centers_ego(3, 4), axes.centers_ego(3, 4)[:, :, ::-1]
+        down.centers_ego(3, 4, 10), axes.centers_ego(3, 4, 10)[:, :, ::-1]
     )
 
 
@@ -75,17 +76,17 @@ def check_official(reference, index, points, is_valid):
 def test_released_reference_points(golden):
     file = np.load(golden / "dinorade_geometry.npz")
     axes, camera = (
-        LiftingAxes.official(),
+        QueryGridOptions.official(),
         official_calibration(golden).camera("pinhole"),
     )
-    on_host = lifting.reference_points(camera, axes, 256, 112, "official")
+    on_host = lifting.reference_points(camera, axes, 256, 112, 10, "official")
     chex.assert_shape(on_host.points, (1, 256, 112, 10, 2))
     assert on_host.points.dtype == np.float32
     check_official(on_host, file["index"], file["reference_points_f64"], file["valid"])
     # In the program, in float32, for two cameras.
     cameras = stack_cameras([camera] * 2)
     in_program = jax.jit(
-        lambda c: lifting.reference_points(c, axes, 256, 112, "official")
+        lambda c: lifting.reference_points(c, axes, 256, 112, 10, "official")
     )(jax.tree.map(jnp.asarray, cameras))
     second = jax.tree.map(lambda x: x[1], in_program)
     check_official(second, file["index"], file["reference_points_f64"], file["valid"])
@@ -98,8 +99,8 @@ def test_released_mask_of_all_queries(shared):
         shared / "data/kradar/calib/common/cam_front0.yml",
         radar_from_lidar_m=lifting.OFFICIAL_OFFSET_M,
     )
-    camera, axes = calibration.camera("pinhole"), LiftingAxes.official()
-    reference = lifting.reference_points(camera, axes, 256, 112, "official")
+    camera, axes = calibration.camera("pinhole"), QueryGridOptions.official()
+    reference = lifting.reference_points(camera, axes, 256, 112, 10, "official")
     check_official(
         reference, file["index"], file["reference_points_f64"], file["valid"]
     )
@@ -108,13 +109,15 @@ def test_released_mask_of_all_queries(shared):
     is_valid = reference.is_valid.ravel()
     np.testing.assert_array_equal(is_valid[is_clear], expected[is_clear])
     # Without the released crop 95.3 % of the queries lie in the image.
-    whole = lifting.reference_points(camera, axes, 256, 112)
+    whole = lifting.reference_points(camera, axes, 256, 112, 10)
     assert whole.is_valid.mean() == pytest.approx(0.953, abs=5e-4)
 
 
 def test_queries_outside_the_image_are_invalid_and_clipped():
-    axes = LiftingAxes((10.0, 10.0), (-60.0, 60.0), (-1.0, 1.0), 1)
-    reference = lifting.reference_points(ahead().camera(), axes, 2, 4)
+    axes = QueryGridOptions(
+        range_m=(10.0, 10.0), azimuth_deg=(-60.0, 60.0), elevation_deg=(-1.0, 1.0)
+    )
+    reference = lifting.reference_points(ahead().camera(), axes, 2, 4, 1)
     # Azimuth -60, 0, 60, 120 degrees: left of the image, in it, right, behind.
     np.testing.assert_array_equal(
         reference.is_valid[0, :, :, 0], [[False, True, False, False]] * 2
@@ -128,11 +131,11 @@ def test_each_sample_has_its_own_camera():
         ahead(yaw_deg=yaw).camera(is_valid=yaw > 85) for yaw in (81.3, 90.2, 94.1)
     ]
     batch = jax.tree.map(jnp.asarray, stack_cameras(cameras))
-    together = jax.jit(lambda c: lifting.reference_points(c, AXES, 5, 4))(batch)
+    together = jax.jit(lambda c: lifting.reference_points(c, AXES, 5, 4, 2))(batch)
     chex.assert_shape(together.points, (3, 5, 4, 2, 2))
     np.testing.assert_array_equal(together.has_image, [False, True, True])
     for i, camera in enumerate(cameras):
-        alone = lifting.reference_points(camera, AXES, 5, 4)
+        alone = lifting.reference_points(camera, AXES, 5, 4, 2)
         np.testing.assert_allclose(together.points[i], alone.points[0], atol=1e-6)
         np.testing.assert_array_equal(together.is_valid[i], alone.is_valid[0])
     assert isinstance(batch, Camera)
@@ -142,7 +145,7 @@ def test_a_camera_of_zeros_sees_nothing():
     zeros = stack_cameras([jax.tree.map(lambda x: 0 * x, ahead().camera())] * 2)
     for camera in (zeros, jax.tree.map(jnp.asarray, zeros)):
         with np.errstate(invalid="ignore", divide="ignore"):
-            reference = lifting.reference_points(camera, AXES, 3, 4)
+            reference = lifting.reference_points(camera, AXES, 3, 4, 2)
         chex.assert_tree_all_finite(reference.points)
         assert not np.any(reference.is_valid)
 
@@ -194,14 +197,14 @@ def test_without_weights_queries_are_copies():
 
 def test_uneven_axes_are_given_by_all_centers_and_continue_into_padding():
     grid = small.uneven_grid()
-    axes = LiftingAxes.of_grid(grid, 1)
+    axes = QueryGridOptions.of_grid(grid)
     assert (len(axes.range_m), len(axes.azimuth_deg)) == (16, 14)
     assert axes.elevation_deg == (-18.0, 18.0)
-    centers = axes.centers_ego(16, 16)[:, :, 0]
+    centers = axes.centers_ego(16, 16, 1)[:, :, 0]
     np.testing.assert_allclose(centers[:, :14, :2], grid.bin_centers_ego(), atol=1e-9)
     padded = grid.padded(8)
     np.testing.assert_allclose(centers[..., :2], padded.bin_centers_ego(), atol=1e-9)
-    assert hash(axes) == hash(LiftingAxes.of_grid(grid, 1))
+    assert hash(axes) == hash(QueryGridOptions.of_grid(grid))
 
 
 @pytest.mark.parametrize(
@@ -214,5 +217,5 @@ def test_uneven_axes_are_given_by_all_centers_and_continue_into_padding():
 )
 def test_impossible_axes_are_named(changes):
     (name,) = changes
-    with pytest.raises(ValueError, match=rf"query_grid.{name} is .* two numbers, or"):
-        dataclasses.replace(AXES, **changes)
+    with pytest.raises(ValueError, match=rf"config.model.query_grid.{name}.* is "):
+        AXES.replace(**changes)

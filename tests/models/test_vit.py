@@ -9,18 +9,14 @@ import numpy as np
 import pytest
 
 from radejax.models import vit
+from radejax.models.options import ViTOptions
 from radejax.models.vit import ViT
 
 from ..small_models import drawn
 
-TINY = {
-    "hidden_size": 16,
-    "num_layers": 2,
-    "num_heads": 2,
-    "mlp_dim": 32,
-    "patch_size": 4,
-    "num_registers": 2,
-}
+TINY = ViTOptions(
+    hidden_size=16, num_layers=2, num_heads=2, mlp_dim=32, patch_size=4, num_registers=2
+)
 
 
 def softmax_attention(*arrays):
@@ -93,12 +89,12 @@ def test_scores_depend_on_relative_position_only():
 
 @pytest.mark.parametrize("fields", [{}, {"gated_mlp": True}])
 def test_shapes_parameters_and_jit(fields):
-    model = ViT(**(TINY | fields))
+    model = ViT(TINY.replace(**fields))
     image = np.random.default_rng(0).standard_normal((2, 8, 12, 3)).astype(np.float32)
     variables = jax.jit(model.init)(jax.random.key(0), image)
     tokens = jax.jit(model.apply)(variables, image)
     chex.assert_shape(tokens, (2, 3 + 2 * 3, 16))
-    assert model.num_prefix == 3
+    assert model.options.num_prefix == 3
     chex.assert_tree_all_finite(tokens)
     # The final normalization: zero mean, unit deviation over channels.
     np.testing.assert_allclose(np.mean(tokens, -1), 0, atol=1e-5)
@@ -110,18 +106,18 @@ def test_shapes_parameters_and_jit(fields):
 
 
 def test_another_image_size_uses_the_same_parameters():
-    model = ViT(**TINY)
+    model = ViT(TINY)
     variables = drawn(model, jnp.zeros((1, 8, 8, 3)))
     tokens = jax.jit(model.apply)(variables, jnp.zeros((1, 12, 20, 3)))
     chex.assert_shape(tokens, (1, 18, 16))
 
 
 def test_images_are_resized_to_the_nearest_multiples_of_the_patch_size():
-    model = ViT(**TINY)
-    assert model.grid(8, 12) == (2, 3)
-    assert model.grid(9, 10) == (2, 3)  # half rounds up
+    model = ViT(TINY)
+    assert TINY.grid(8, 12) == (2, 3)
+    assert TINY.grid(9, 10) == (2, 3)  # half rounds up
     # K-Radar's images for DINOv2: 714 x 1274 pixels.
-    assert model.clone(patch_size=14).grid(720, 1280) == (51, 91)
+    assert TINY.replace(patch_size=14).grid(720, 1280) == (51, 91)
     variables = drawn(model, jnp.zeros((1, 8, 8, 3)))
     ramp = np.linspace(-1, 1, 90, dtype=np.float32).reshape(1, 9, 10, 1)
     image = np.repeat(ramp, 3, -1)
@@ -142,7 +138,7 @@ def test_bicubic_weights_are_those_of_torch(golden, new, antialias):
 
 
 def test_learned_positions_distinguish_patches():
-    model = ViT(**TINY, position_grid=3)
+    model = ViT(TINY.replace(position_grid=3))
     images = jnp.zeros((1, 12, 12, 3))
     variables = drawn(model, images)
     tokens = np.asarray(jax.jit(model.apply)(variables, images))[0, 3:]
@@ -153,12 +149,12 @@ def test_learned_positions_distinguish_patches():
 @pytest.mark.slow
 def test_remat_changes_nothing():
     image = np.random.default_rng(0).standard_normal((1, 8, 8, 3)).astype(np.float32)
-    variables = jax.jit(ViT(**TINY).init)(jax.random.key(0), image)
+    variables = jax.jit(ViT(TINY).init)(jax.random.key(0), image)
 
     @functools.partial(jax.jit, static_argnums=1)
     @jax.grad
     def gradient(variables, remat):
-        return jnp.sum(ViT(**TINY, remat=remat).apply(variables, image) ** 3)
+        return jnp.sum(ViT(TINY, remat=remat).apply(variables, image) ** 3)
 
     plain = gradient(variables, False)
     chex.assert_trees_all_close(gradient(variables, True), plain, rtol=1e-5, atol=1e-4)
@@ -167,9 +163,9 @@ def test_remat_changes_nothing():
 
 def test_bfloat16_stays_close():
     image = np.random.default_rng(0).standard_normal((1, 16, 16, 3)).astype(np.float32)
-    variables = jax.jit(ViT(**TINY).init)(jax.random.key(0), image)
-    exact = jax.jit(ViT(**TINY).apply)(variables, image)
-    half = jax.jit(ViT(**TINY, dtype=jnp.bfloat16).apply)(variables, image)
+    variables = jax.jit(ViT(TINY).init)(jax.random.key(0), image)
+    exact = jax.jit(ViT(TINY).apply)(variables, image)
+    half = jax.jit(ViT(TINY, dtype=jnp.bfloat16).apply)(variables, image)
     assert half.dtype == jnp.float32
     assert 0 < np.abs(half - exact).max() < 0.1
 
@@ -178,4 +174,4 @@ def test_bfloat16_stays_close():
 @pytest.mark.parametrize("shape", [(1, 3, 8, 8), (8, 8, 3)])
 def test_images_of_a_wrong_shape_are_rejected(shape):
     with pytest.raises(AssertionError, match="expected"):
-        ViT(**TINY).init(jax.random.key(0), jnp.zeros(shape))
+        ViT(TINY).init(jax.random.key(0), jnp.zeros(shape))

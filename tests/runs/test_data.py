@@ -8,24 +8,24 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ml_collections import ConfigDict
 
 from radejax import models
-from radejax.core.config import base_config
+from radejax.config import Config
 from radejax.core.errors import UserError
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.reduce import reduce_dataset
-from radejax.runs import checks
 from radejax.runs import data as run_data
 from radejax.runs.data import Data, data_name, data_of_run, located, open_data
-from radejax.simulation.dataset import default_config, simulate_dataset
+from radejax.simulation.config import SimulationOptions
+from radejax.simulation.dataset import simulate_dataset
+
+SMALL = SimulationOptions(train_sequences=2, test_sequences=1)
 
 
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     """Sequences 1 and 2 of the train split, 3 of the test split, of two frames."""
-    simulation = default_config() | {"output": "projection", "frames_per_sequence": 2}
-    simulation |= {"train_sequences": 2, "test_sequences": 1}
+    simulation = SMALL.replace(output="projection", frames_per_sequence=2)
     root = tmp_path_factory.mktemp("simulated") / "sim"
     return simulate_dataset(simulation, root, progress=False)
 
@@ -35,21 +35,21 @@ def root(simulated: pathlib.Path, tmp_path: pathlib.Path) -> pathlib.Path:
     return pathlib.Path(shutil.copytree(simulated, tmp_path / "sim"))
 
 
-def _config(*roots: object, **paths: Any) -> ConfigDict:
-    config = base_config()
-    config.data.update(paths, roots=tuple(map(str, roots)))
-    config.model.update(doppler_bins=16, elevation_bins=9)
-    config.train.batch_size = 1
-    return config
+def _config(*roots: object, batch_size: int = 1, **fields: Any) -> Config:
+    return Config().replace(
+        model={"doppler_bins": 16, "elevation_bins": 9},
+        train={"batch_size": batch_size},
+        data={"roots": tuple(map(str, roots)), **fields},
+    )
 
 
-def _open(config: ConfigDict) -> Data:
+def _open(config: Config) -> Data:
     return open_data(located(config), models.build(config.model))
 
 
 def test_without_data_and_simulation_the_flag_is_named() -> None:
     with pytest.raises(UserError, match=r"give --data ROOT"):
-        located(base_config())
+        located(Config())
 
 
 def test_a_missing_folder_is_named(tmp_path: pathlib.Path) -> None:
@@ -66,18 +66,15 @@ def test_paths_are_absolute_and_simulations_named_by_their_config(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "v2.zip").touch()
-    config = _config(labels="v2.zip")
-    config.simulation = ConfigDict(default_config())
+    config = _config(labels="v2.zip").replace(simulation=SimulationOptions())
     here = located(config).data
     (root,) = here.roots
     assert root.startswith(str(tmp_path / "data" / "simulated-"))
     assert here.records == f"{root}/records"
     assert here.labels == str(tmp_path / "v2.zip")
-    config.simulation.seed += 1
-    assert located(config).data.roots != here.roots
-    config.data.roots = ("a", "b")
+    assert located(config.replace(simulation={"seed": 1})).data.roots != here.roots
     with pytest.raises(UserError, match="expected one folder, as the config simulates"):
-        located(config)
+        located(config.replace(data={"roots": ("a", "b")}))
 
 
 def test_frames_are_projected_beside_their_data_once(
@@ -87,29 +84,26 @@ def test_frames_are_projected_beside_their_data_once(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     monkeypatch.chdir(root.parent)
-    config = _config("sim")
-    config.model.doppler_bins = 64
-    with pytest.raises(UserError, match="doppler_bins is 64, expected 16, as the rad"):
-        _open(config)
-    config = _config("sim")
-    config.train.batch_size = 5
-    with pytest.raises(UserError, match="4 frames are fewer than one batch"):
-        _open(config)
-    config = _config("sim", visibility=())
-    config.train.batch_size = 4
-    with pytest.raises(
-        UserError, match="4 frames of the train split have no object of"
+    for wrong, message in (
+        (
+            _config("sim").replace(model={"doppler_bins": 64}),
+            "doppler_bins is 64, expected 16, as the rad",
+        ),
+        (_config("sim", batch_size=5), "4 frames are fewer than one batch"),
+        (
+            _config("sim", batch_size=4, visibility=()),
+            "4 frames of the train split have no object of",
+        ),
     ):
-        _open(config)
+        with pytest.raises(UserError, match=message):
+            _open(wrong)
     assert not (root / "records").exists()
-    config = _config("sim")
-    config.train.batch_size = 4
+    config = _config("sim", batch_size=4)
     with caplog.at_level("INFO", "radejax"):
         data = _open(config)
         assert re.search(r"input: 0\.64\d ± 0\.04\d in 4 frames to train", caplog.text)
         assert "nearly constant" not in caplog.text
-        config.model.input_center = 0.4
-        _open(config)
+        _open(config.replace(model={"input_center": 0.4}))
     assert "set --config.model.input_center=0.64" in caplog.text
     assert data.options.roots == (str(root),)
     assert data.options.records == str(root / "records")
@@ -130,33 +124,27 @@ def test_reduced_releases_are_read_with_and_without_doppler(
     root: pathlib.Path, tmp_path: pathlib.Path
 ) -> None:
     """Also next to each other, as they have records of their own."""
-    simulation = default_config() | {"frames_per_sequence": 1, "image_width": 0}
-    simulation |= {"train_sequences": 2, "test_sequences": 1}
+    simulation = SMALL.replace(frames_per_sequence=1, image_width=0)
     tensors = simulate_dataset(simulation, tmp_path / "tensors", progress=False)
     reduced = tmp_path / "reduced"
     reduce_dataset([tensors], reduced, "polar3d")
     found = {}
     for doppler_bins in (16, 0):
-        config = _config(reduced)
-        config.model.doppler_bins = doppler_bins
-        config.data.release = "polar3d"
-        config.simulation = ConfigDict(simulation)
-        checks.check(config)
+        config = _config(reduced, release="polar3d").replace(
+            model={"doppler_bins": doppler_bins}, simulation=simulation
+        )
         data = _open(config)
         assert data.frames.grid.num_doppler == doppler_bins
         found[doppler_bins] = data.records[data.split("test")[0].key]
     assert found[16].shape == (64, 56, 16 + 9)
     np.testing.assert_array_equal(found[0], found[16][..., 16:])
-    config.data.release = "rpc"
     with pytest.raises(UserError, match=r"reduced: polar3d, but the model is for rpc"):
-        _open(config)
-    config.data.release = None
-    config.data.roots, config.simulation = (str(root),), None
-    del config.simulation
+        _open(config.replace(data={"release": "rpc"}))
+    recorded = {"release": None, "roots": (str(root),)}
     with pytest.raises(
         UserError, match=r"doppler_bins is 0, expected 16, as the radar"
     ):
-        _open(config)
+        _open(config.replace(data=recorded, simulation=None))
 
 
 def test_results_on_other_data_are_named_by_folder_and_labels(
@@ -229,7 +217,7 @@ def test_a_run_is_evaluated_on_its_part_or_on_all_of_other_folders(
     assert (chosen.data.label_version, own.data.label_version) == ("v2.0", "v2.1")
     assert (other.data.embeddings, other.data.labels) == (None, None)
     assert other.data.records == f"{copy}/records"
-    own.data.update(labels=None, embeddings=None)
+    saved.config = own.replace(data={"labels": None, "embeddings": None})
     for changes, expected in (
         (None, {1, 3}),
         ({"label_version": "v2.1"}, {1, 3}),
@@ -240,7 +228,6 @@ def test_a_run_is_evaluated_on_its_part_or_on_all_of_other_folders(
     ):
         _, found = data_of_run(saved, changes)
         assert {frame.sequence for frame in found.frames} == expected
-    assert tuple(own.data.sequences) == (1, 3)
 
 
 def test_sequences_are_held_out_for_validation(
@@ -250,9 +237,8 @@ def test_sequences_are_held_out_for_validation(
         names = ("train", "validation", "test")
         return [[f.sequence for f in data.split(name)] for name in names]
 
-    config = _config(root, validation=(1,))
     with caplog.at_level("INFO", "radejax"):
-        data = _open(config)
+        data = _open(_config(root, validation=(1,)))
     assert sequences(data) == [[2, 2], [1, 1], [3, 3]]
     assert data.choosing_split == "validation"
     assert "frames left out: held out for validation" in data.split("train").counts

@@ -8,16 +8,15 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from ml_collections import ConfigDict
 
-from radejax.core.config import base_config
+from radejax.config import Config
 from radejax.core.errors import UserError
 from radejax.core.structures import DetectionMaps
 from radejax.data.kradar import Frame
 from radejax.detection.decode import decode
-from radejax.evaluation.results import EvaluationOptions
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.runs import evaluate
+from radejax.runs.evaluate import report_options
 
 
 def _shuffled(paths: list[str | None], seed: int) -> list[Any]:
@@ -74,32 +73,25 @@ def test_a_cut_when_scoring_is_a_cut_when_decoding() -> None:
         np.testing.assert_array_equal(low[name][above], column)
 
 
-def _config(**evaluation: object) -> ConfigDict:
-    config = base_config()
-    config.evaluation.update(evaluation)
-    return config
-
-
 def test_settings_of_a_run_hold_for_all_protocols_except_all_point() -> None:
-    options = EvaluationOptions.from_config(_config(empty_frames="class"))
+    config = Config().replace(evaluation={"empty_frames": "class"})
+    options = report_options(config)
     expected = {"score_threshold": 0.3, "empty_frames": "class"}
     assert options.settings_of("kradar_r40") == expected
     expected = {"score_threshold": 0.05, "empty_frames": "protocol"}
     assert options.settings_of("all_point") == expected
     # A threshold below what the run would store is kept.
-    options = EvaluationOptions.from_config(_config(score_threshold=0.0))
-    assert options.min_score == 0.0
+    config = Config().replace(evaluation={"score_threshold": 0.0})
+    assert report_options(config).min_score == 0.0
 
 
 def test_changes_replace_what_the_config_says() -> None:
     changes = {"protocols": ("auc",), "min_score": 0.2, "roi": None}
-    config = _config()
-    options = EvaluationOptions.from_config(config, **changes, classes=("Sedan",))
+    options = report_options(Config(), **changes, classes=("Sedan",))
     assert (options.protocols, options.min_score) == (("auc",), 0.2)
     assert (options.roi, options.classes) == (None, ("Sedan",))
-    assert config.evaluation.protocols == base_config().evaluation.protocols
     with pytest.raises(UserError, match="'Tram', expected some of the run's: Sed"):
-        EvaluationOptions.from_config(config, classes=("Tram",))
+        report_options(Config(), classes=("Tram",))
 
 
 @pytest.mark.parametrize(
@@ -134,7 +126,7 @@ def test_numbers_on_what_chose_the_checkpoint_are_marked(
     written: dict[str, Any] = {}
     data = SimpleNamespace(choosing_split=choosing, preprocess=lambda: None)
     saved = {"run": "run", "variables": None, "step": 3}
-    loaded = SimpleNamespace(config=_config(), **saved)
+    loaded = SimpleNamespace(config=Config(), **saved)
     monkeypatch.setattr(evaluate, "load_model", lambda *_, **__: loaded)
     monkeypatch.setattr(evaluate, "data_of_run", lambda *_: (loaded.config, data))
     evaluation = SimpleNamespace(report=lambda *_, **named: written.update(named))
@@ -169,7 +161,7 @@ def test_other_options_have_another_folder(
 ) -> None:
     written: list[pathlib.Path] = []
     data = SimpleNamespace(choosing_split="test", preprocess=lambda: None)
-    loaded = SimpleNamespace(config=_config(), run="run", variables=None, step=3)
+    loaded = SimpleNamespace(config=Config(), run="run", variables=None, step=3)
     monkeypatch.setattr(evaluate, "load_model", lambda *_, **__: loaded)
     monkeypatch.setattr(evaluate, "data_of_run", lambda *_: (loaded.config, data))
     evaluation = SimpleNamespace(report=lambda *_, out, **__: written.append(out))

@@ -8,21 +8,30 @@ from typing import Any
 
 import pytest
 
-from radejax.core.config import base_config, load_config
+from radejax.config import Config, load_config
 from radejax.core.errors import UserError
 from radejax.data.kradar import dataset
-from radejax.detection.decode import DecodeOptions
 from radejax.inference.detect_files import detect_files
 from radejax.inference.saved import load_model
 from radejax.runs import evaluate, experiment
 from radejax.runs.experiment import claimed
-from radejax.simulation.dataset import default_config, simulate_dataset
-from radejax.training import loop
+from radejax.simulation.config import SimulationOptions
+from radejax.simulation.dataset import simulate_dataset
+from radejax.training import distributed, loop
 from radejax.training.checkpoints import Checkpoints
 
 from .. import small_models as small
 
-CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
+
+def _small_run(folder: pathlib.Path, **simulation: Any) -> Config:
+    """Config of a run of seconds on data that are simulated in a folder."""
+    return small.shrink_run(load_config("quickstart:short")).replace(
+        simulation={"output": "projection", **simulation},
+        data={"roots": (str(folder / "data"),)},
+        model={"cbam": "off", "widths": (8,)},
+        train={"num_epochs": 1},
+        evaluation={"num_visualizations": 0},
+    )
 
 
 @pytest.mark.usefixtures("one_device")
@@ -38,22 +47,20 @@ def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
         said_before.append(caplog.text)
         return SimpleNamespace(step=1), True
 
-    simulation = default_config()
-    simulation.update(train_sequences=1, test_sequences=0, frames_per_sequence=2)
-    simulation["output"] = "projection"
+    simulation = SimulationOptions(
+        output="projection", train_sequences=1, test_sequences=0, frames_per_sequence=2
+    )
     root = simulate_dataset(simulation, tmp_path / "data", progress=False)
-    config = base_config()
-    config.model.update(doppler_bins=16, elevation_bins=9)
-    config.train.batch_size = 2
-    config.decode.update(score_threshold=0.25, nms_iou=0.4, threshold_inclusive=False)
+    config = Config().replace(
+        model={"doppler_bins": 16, "elevation_bins": 9},
+        train={"batch_size": 2},
+        data={"roots": (str(root),)},
+    )
     monkeypatch.setattr(loop, "train", train)
-    config.data.roots = (str(root),)
     experiment.run(config, tmp_path / "run")
     assert f"no frames of the test split in {root}" in said_before[0]
     assert not (tmp_path / "run" / "evaluation").exists()
     assert "radejax detect" in caplog.text
-    # What NMS chooses for the loss is what decoding finds.
-    assert loop.loss_options(config)["decoding"] == DecodeOptions(**config.decode)
 
 
 def test_frames_and_frozen_weights_tell_whether_a_run_is_the_same() -> None:
@@ -87,15 +94,9 @@ def test_labels_are_read_once(
         return read(path, version, **options)
 
     monkeypatch.setattr(dataset, "read_label_file", count)
-    config = load_config(f"{CONFIGS / 'quickstart.py'}:short")
-    config.simulation.update(
-        train_sequences=3, frames_per_sequence=2, output="projection"
+    config = _small_run(tmp_path, train_sequences=3, frames_per_sequence=2).replace(
+        data={"validation": (2,)}, train={"evaluate_every_epochs": 1}
     )
-    config = small.shrink_run(config)
-    config.data.validation = (2,)
-    config.model.update(cbam="off", widths=(8,))
-    config.train.update(num_epochs=1, evaluate_every_epochs=1)
-    config.evaluation.num_visualizations = 0
     evaluated = []
     make = evaluate.tables_from_frames
     monkeypatch.setattr(
@@ -104,7 +105,6 @@ def test_labels_are_read_once(
         lambda f, split: evaluated.append([x.sequence for x in f]) or make(f, split),
     )
     with caplog.at_level("INFO", "radejax"):
-        config.data.roots = (str(tmp_path / "data"),)
         folder = experiment.run(config, tmp_path / "run")
     assert evaluated == [[2, 2], [4, 4]]
     (events,) = (folder / "tensorboard").glob("*.test")
@@ -124,15 +124,9 @@ def test_a_run_of_two_frames(
     tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Training, evaluation and detection; weights fit models of two frames only."""
-    config = load_config(f"{CONFIGS / 'quickstart.py'}:short")
-    config.simulation.update(
-        train_sequences=2, frames_per_sequence=3, output="projection"
+    config = _small_run(tmp_path, train_sequences=2, frames_per_sequence=3).replace(
+        data={"num_frames": 2}, model={"input_stem": True}
     )
-    config = small.shrink_run(config)
-    config.data.update(num_frames=2, roots=(str(tmp_path / "data"),))
-    config.model.update(cbam="off", widths=(8,), input_stem=True)
-    config.train.num_epochs = 1
-    config.evaluation.num_visualizations = 0
     with caplog.at_level("INFO", "radejax"):
         folder = experiment.run(config, tmp_path / "run")
     assert "2 of 6 samples of 2 frames repeat one" in caplog.text
@@ -144,13 +138,40 @@ def test_a_run_of_two_frames(
     root, out = tmp_path / "data", tmp_path / "boxes"
     count = detect_files(folder, [root], out, score_threshold=0.0)
     assert (count["frames"], count["repeated"]) == (9, 3)
-    config.data.num_frames = 1
+    one = config.replace(data={"num_frames": 1})
     with pytest.raises(UserError, match=r"run do not fit config.model .*stem/doppler"):
-        experiment.run(config, tmp_path / "one", init_from=folder)
-    config.data.update(num_frames=2, roots=(str(tmp_path / "single"),))
-    config.simulation.update(train_sequences=4, frames_per_sequence=1)
+        experiment.run(one, tmp_path / "one", init_from=folder)
+    single = config.replace(
+        data={"roots": (str(tmp_path / "single"),)},
+        simulation={"train_sequences": 4, "frames_per_sequence": 1},
+    )
     with pytest.raises(UserError, match=r"num_frames is 2, expected 1, as no frame to"):
-        experiment.run(config, tmp_path / "single_run")
+        experiment.run(single, tmp_path / "single_run")
+
+
+def test_nothing_is_written_for_paths_that_do_not_exist(tmp_path: pathlib.Path) -> None:
+    config = Config().replace(train={"batch_size": 8})
+    for root, start, message in (
+        (tmp_path / "nope", None, r"no such file or folder: .*nope"),
+        (tmp_path, tmp_path / "weights.pth", r"weights\.pth"),
+    ):
+        at = config.replace(data={"roots": (str(root),)})
+        with pytest.raises(FileNotFoundError, match=message):
+            experiment.run(at, tmp_path / "run", init_from=start)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_batch_that_does_not_divide_is_rejected_first(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mesh = distributed.make_mesh(4)
+    monkeypatch.setattr(distributed, "make_mesh", lambda *_: mesh)
+    config = load_config("quickstart").replace(train={"batch_size": 2})
+    with pytest.raises(
+        UserError, match=r"batch_size is 2, expected a multiple of 4 devices"
+    ):
+        experiment.run(config, tmp_path / "run")
+    assert not list(tmp_path.iterdir())
 
 
 # Work folders ------------------------------------------------------------------------
@@ -159,25 +180,19 @@ def test_a_run_of_two_frames(
 def test_a_work_folder_keeps_its_config_and_rejects_another(
     tmp_path: pathlib.Path,
 ) -> None:
-    config = base_config()
-    for _ in range(2):
-        with claimed(tmp_path, config):
-            kept = json.loads((tmp_path / "config.json").read_text())
-            assert kept == json.loads(config.to_json())
-    config.train.num_epochs = 7  # nothing is trained: the folder takes it
-    with claimed(tmp_path, config):
-        kept = json.loads((tmp_path / "config.json").read_text())
-        assert kept["train"]["num_epochs"] == 7
+    config = Config()
+    # As long as nothing is trained, the folder takes another config.
+    for kept in (config, config, config.replace(train={"num_epochs": 7})):
+        with claimed(tmp_path, kept):
+            assert Config(**json.loads((tmp_path / "config.json").read_text())) == kept
     (tmp_path / "checkpoints" / "1").mkdir(parents=True)
-    config.train.batch_size = 3
-    config.seed = 5
     with (
         pytest.raises(
             UserError,
             match=r"config\.seed is 0 there and 5 here; "
             r"config\.train\.batch_size is 10 there and 3 here.*--workdir",
         ),
-        claimed(tmp_path, config),
+        claimed(tmp_path, kept.replace(seed=5, train={"batch_size": 3})),
     ):
         pass
 
@@ -185,12 +200,12 @@ def test_a_work_folder_keeps_its_config_and_rejects_another(
 def test_a_second_training_in_a_work_folder_is_rejected(tmp_path: pathlib.Path) -> None:
     folder = tmp_path / "run"
     with (
-        claimed(folder, base_config()),
+        claimed(folder, Config()),
         pytest.raises(UserError, match=r"another training is at work in .*run: wait"),
-        claimed(folder, base_config()),
+        claimed(folder, Config()),
     ):
         pass
-    with claimed(folder, base_config()):  # let go, though the file is there
+    with claimed(folder, Config()):  # let go, though the file is there
         pass
 
 
@@ -223,8 +238,7 @@ def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
         return workdir
 
     monkeypatch.setattr(experiment, "run", run)
-    config = base_config()
-    experiment.run_seeds(config, tmp_path / "runs", range(3), init_from="w")
+    experiment.run_seeds(Config(), tmp_path / "runs", range(3), init_from="w")
     assert seen == [(i, f"seed{i}", "w") for i in range(3)]
     rows = json.loads((tmp_path / "runs" / "seeds.json").read_text())
     assert [row["cls"] for row in rows] == ["Sedan", "Sedan"]
@@ -243,4 +257,4 @@ def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
 def test_seeds_are_different(tmp_path: pathlib.Path) -> None:
     message = r"--seeds is \(1, 2, 1\), expected different seeds"
     with pytest.raises(UserError, match=message):
-        experiment.run_seeds(base_config(), tmp_path, (1, 2, 1))
+        experiment.run_seeds(Config(), tmp_path, (1, 2, 1))

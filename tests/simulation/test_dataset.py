@@ -23,16 +23,15 @@ from radejax.data.tesseract import read_tesseract
 from radejax.inference.saved import SavedModel
 from radejax.simulation import dataset
 from radejax.simulation.camera.renderer import stereo_calibration
-from radejax.simulation.config import SimulationConfig
-from radejax.simulation.dataset import default_config, simulate_dataset
+from radejax.simulation.config import SimulationOptions
+from radejax.simulation.dataset import simulate_dataset
 from radejax.simulation.simulator import make_source
 
 from .. import small_models as small
 
 
 def small_config(**changes):
-    config = default_config()
-    config |= {
+    fields = {
         "train_sequences": 2,
         "test_sequences": 1,
         "frames_per_sequence": 3,
@@ -46,7 +45,7 @@ def small_config(**changes):
             "max_range_m": 62.0,
         },
     }
-    return config | changes
+    return SimulationOptions(**fields | changes)
 
 
 def digests(root):
@@ -89,8 +88,8 @@ class TestTree:
 
     def test_a_model_sees_through_the_cameras_that_drew_the_images(self, tree):
         cameras = camera_inputs(KRadar(tree)[:1], (36, 64), CameraOptions()).cameras
-        shift = small_config()["radar_from_lidar_m"]
-        drawn = stereo_calibration(tuple(shift), 64, 36)[0].camera()
+        shift = small_config().radar_from_lidar_m
+        drawn = stereo_calibration(shift, 64, 36)[0].camera()
         np.testing.assert_allclose(
             cameras[0].cam_from_ego, drawn.cam_from_ego, atol=1e-12
         )
@@ -141,7 +140,9 @@ class TestRepeating:
         ]
         assert found[0] == found[1] == found[2]
         ideal = simulate_dataset(
-            config | {"radar": {"preset": "ideal"}}, tmp_path / "ideal", progress=False
+            config.replace(radar={"preset": "ideal"}),
+            tmp_path / "ideal",
+            progress=False,
         )
         assert digests(ideal) != found[0]
 
@@ -223,10 +224,9 @@ class TestWrongUse:
 
 @pytest.mark.parametrize("output", ["tesseract", "projection"])
 def test_expected_size_is_that_of_the_files(output, tmp_path):
-    values = small_config(output=output, train_sequences=1, frames_per_sequence=1)
-    config = SimulationConfig.from_mapping(values)
+    config = small_config(output=output, train_sequences=1, frames_per_sequence=1)
     num_frames, expected = dataset.expected_size(config, make_source(config))
-    root = simulate_dataset(values, tmp_path / "data", progress=False)
+    root = simulate_dataset(config, tmp_path / "data", progress=False)
     files = [p for p in root.rglob("*") if p.suffix in (".mat", ".npy", ".png")]
     assert num_frames == 2
     assert expected == pytest.approx(sum(p.stat().st_size for p in files), rel=0.2)
@@ -247,14 +247,15 @@ def test_a_sensor_without_elevation_is_a_kradar_tree_without_its_channels(tmp_pa
     assert projection.shape == grid.projection_shape == (32, 14, 4)
     np.testing.assert_array_equal(projection, project_tensor(power)[..., :4])
     # As the input of a detector, the tensor gives what its projection gives.
-    config = small.radar_config()
-    config.model.update(doppler_bins=4, elevation_bins=0)
+    config = small.radar_config().replace(
+        model={"doppler_bins": 4, "elevation_bins": 0}
+    )
     variables = small.drawn(models.build(config.model), projection[None])
     detector = Detector(SavedModel(config, grid, variables), score_threshold=0.0)
     by_power, by_projection = detector(power), detector(projection)
     np.testing.assert_allclose(by_power.scores, by_projection.scores, atol=1e-3)
     assert by_power.is_valid.any()
-    config.data.num_frames = 2
+    config = config.replace(data={"num_frames": 2})
     stacked = np.tile(projection, 2)[None]
     variables = small.drawn(models.build(config.model, 2), stacked)
     several = Detector(SavedModel(config, grid, variables), score_threshold=0.0)

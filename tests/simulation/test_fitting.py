@@ -14,7 +14,7 @@ from radejax.cli.main import main
 from radejax.core.errors import DataError, UserError
 from radejax.data.kradar.write import write_tesseract
 from radejax.data.tesseract import read_tesseract
-from radejax.simulation.config import default_config
+from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
 from radejax.simulation.fitting import fit_files
 
@@ -24,10 +24,8 @@ SMALL = {"image_width": 0, "image_height": 0, "frames_per_sequence": 1}
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory) -> pathlib.Path:
     """Three frames of the realistic sensor."""
-    radar = default_config()["radar"] | {"preset": "realistic"}
-    config = default_config() | SMALL
-    config |= {"radar": radar, "train_sequences": 3, "test_sequences": 0}
-    return simulate_dataset(config, tmp_path_factory.mktemp("a") / "b", progress=False)
+    options = SimulationOptions(**SMALL, train_sequences=3, test_sequences=0)
+    return simulate_dataset(options, tmp_path_factory.mktemp("a") / "b", progress=False)
 
 
 def test_command_writes_section_and_figure_and_simulates_them(recorded, tmp_path):
@@ -46,11 +44,11 @@ def test_command_writes_section_and_figure_and_simulates_them(recorded, tmp_path
     arguments = ["simulate", "--radar", str(out / "radar.json"), "--frames", "1"]
     config = tmp_path / "config.py"
     config.write_text(
-        "from radejax.core.config import base_config\n"
+        "from radejax.config import Config\n"
         "def get_config(arg=None):\n"
-        "    config = base_config()\n"
-        f"    config.simulation = {dict(SMALL, train_sequences=1, test_sequences=0)}\n"
-        "    return config\n"
+        "    model = {'doppler_bins': 16, 'elevation_bins': 9}\n"
+        f"    simulation = {dict(SMALL, train_sequences=1, test_sequences=0)}\n"
+        "    return Config(model=model, simulation=simulation)\n"
     )
     arguments += ["--config", str(config), "--out", str(again)]
     done = CliRunner().invoke(main, arguments)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.simulation.config import SimulationConfig, default_config
+from radejax.simulation.config import SimulationOptions
 from radejax.simulation.radar.tensor import RadarParameters
 from radejax.simulation.simulator import SequenceSimulator, make_source
 from radejax.simulation.world.traffic import make_sequence
@@ -105,8 +105,7 @@ def test_labels_are_in_the_lidar_frame(urban):
 
 @pytest.fixture
 def source():
-    values = default_config() | {"train_sequences": 2, "test_sequences": 1}
-    return make_source(SimulationConfig.from_mapping(values))
+    return make_source(SimulationOptions(train_sequences=2, test_sequences=1))
 
 
 def test_training_sequences_come_first(source):
@@ -125,10 +124,9 @@ def test_sensors_count_their_own_frames(source):
 
 
 def test_vru_density_scale_changes_training_scenes_only():
-    values = default_config() | {"train_sequences": 6, "test_sequences": 6}
+    options = SimulationOptions(train_sequences=6, test_sequences=6)
     natural, added = (
-        make_source(SimulationConfig.from_mapping(values | {"vru_density_scale": n}))
-        for n in (1.0, 4.0)
+        make_source(options.replace(vru_density_scale=n)) for n in (1.0, 4.0)
     )
 
     def classes(source, numbers):

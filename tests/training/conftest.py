@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 
 from radejax import models
-from radejax.core.config import base_config
+from radejax.config import Config
 from radejax.core.structures import Batch
 from radejax.geometry.radar_grid import RadarGrid
+from radejax.losses.detection import LossOptions
+from radejax.models.options import RadeNetOptions
+from radejax.training.options import TrainOptions
 
 from ..small_models import drawn
 
@@ -23,7 +26,7 @@ NUM_FRAMES = 16
 class Tiny:
     """What a training needs."""
 
-    config: Any
+    config: Config
     model: Any
     variables: Any
     grid: RadarGrid
@@ -44,26 +47,27 @@ def tiny() -> Tiny:
     grid = RadarGrid.reduced(
         num_doppler=2, num_range=16, num_elevation=2, num_azimuth=14, max_range_m=30.0
     )
-    config = base_config()
-    config.model.update(
-        doppler_bins=2,
-        elevation_bins=2,
-        widths=(8, 8, 16),
-        decoder_width=8,
-        num_groups=4,
-        cbam="off",  # the loop does not care, and the compiler is done sooner
-        neck="plain",
-        heads="default",
-        heatmap_prior=0.1,
-    )
-    config.loss.heatmap_sigma_bins = 1.0
-    config.train.update(
-        batch_size=4,
-        num_epochs=2,
-        learning_rate=3e-3,
-        log_every_steps=1,
-        checkpoint_every_steps=3,
-        max_skipped_steps=2,
+    config = Config(
+        model=RadeNetOptions(
+            doppler_bins=2,
+            elevation_bins=2,
+            widths=(8, 8, 16),
+            decoder_width=8,
+            num_groups=4,
+            cbam="off",  # the loop does not care, and the compiler is done sooner
+            neck="plain",
+            heads="default",
+            heatmap_prior=0.1,
+        ),
+        loss=LossOptions(heatmap_sigma_bins=1.0),
+        train=TrainOptions(
+            batch_size=4,
+            num_epochs=2,
+            learning_rate=3e-3,
+            log_every_steps=1,
+            checkpoint_every_steps=3,
+            max_skipped_steps=2,
+        ),
     )
     model = models.build(config.model)
     variables = drawn(model, np.zeros((1, *grid.projection_shape)))

@@ -17,13 +17,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from ml_collections import ConfigDict
 
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import DetectionMaps
 from radejax.training import distributed, loop
 from radejax.training.checkpoints import Checkpoints
 from radejax.training.metric_logger import Scores
+from radejax.training.options import TrainOptions
 from radejax.training.step import make_schedule
 
 Tiny = Any  # the fixture `tiny` of conftest.py
@@ -41,9 +41,9 @@ def compiled_once() -> Iterator[None]:
     fields = (*fields, "gradient_accumulation_steps")
 
     def key(x: Any) -> Any:
-        if isinstance(x, ConfigDict):
+        if isinstance(x, TrainOptions):
             assert x.schedule == "cosine"  # does not count epochs
-            return tuple(x[name] for name in fields)
+            return tuple(getattr(x, name) for name in fields)
         return x if isinstance(x, int) else id(x)
 
     def cached(make: Any) -> Any:
@@ -146,8 +146,8 @@ def test_a_run_ends_after_its_epochs_and_learns(undisturbed: Any) -> None:
 def test_a_run_ends_after_the_given_steps(
     run: Any, tiny: Tiny, tmp_path: pathlib.Path, max_steps: int, expected: int
 ) -> None:
-    config = tiny.config.copy_and_resolve_references()
-    config.train.update(max_steps=max_steps, evaluate_every_epochs=1)
+    changes = {"max_steps": max_steps, "evaluate_every_epochs": 1}
+    config = tiny.config.replace(train=changes)
     evaluate = mock.Mock(return_value=Scores({}, best=1.0))
     state, is_finished = run(tmp_path, config=config, evaluate=evaluate)
     assert is_finished
@@ -163,9 +163,8 @@ def test_a_seed_initializes_the_variables(
     run: Any, tiny: Tiny, tmp_path: pathlib.Path
 ) -> None:
     def initial(name: str, seed: int) -> Any:
-        config = tiny.config.copy_and_resolve_references()
-        config.seed = seed
-        config.train.update(num_epochs=1, learning_rate=1e-30, final_learning_rate=0.0)
+        rates = {"learning_rate": 1e-30, "final_learning_rate": 0.0}
+        config = tiny.config.replace(seed=seed, train={"num_epochs": 1} | rates)
         options = {"steps_per_epoch": 1, "variables": None, "config": config}
         return run(tmp_path / name, **options)[0].params
 
@@ -204,8 +203,7 @@ def test_sigterm_saves_and_stops(
 def test_sigterm_in_an_evaluation_saves_and_stops(
     run: Any, tiny: Tiny, undisturbed: Any, workdir: pathlib.Path
 ) -> None:
-    config = tiny.config.copy_and_resolve_references()
-    config.train.evaluate_every_epochs = 1
+    config = tiny.config.replace(train={"evaluate_every_epochs": 1})
 
     def evaluate(_: Any, should_stop: Any) -> Scores:
         assert not should_stop()
@@ -348,8 +346,8 @@ def test_steps_without_finite_loss_end_the_run(
 def test_evaluation_on_the_way_is_logged_and_the_best_kept(
     run: Any, tiny: Tiny, workdir: Any
 ) -> None:
-    config = tiny.config.copy_and_resolve_references()
-    config.train.update(evaluate_every_epochs=1, num_epochs=4, checkpoints_to_keep=1)
+    changes = {"evaluate_every_epochs": 1, "num_epochs": 4, "checkpoints_to_keep": 1}
+    config = tiny.config.replace(train=changes)
 
     values = iter((1.5, 3.5, 2.5, 2.0))
 
@@ -401,8 +399,7 @@ def test_debugging_works_in_a_run(
     model = _Logarithm()
     inputs = np.zeros((1, *tiny.grid.projection_shape))
     variables = model.init(jax.random.key(0), inputs)
-    config = tiny.config.copy_and_resolve_references()
-    config.train.max_steps = 1
+    config = tiny.config.replace(train={"max_steps": 1})
     jax.config.update(setting, True)
     try:
         if setting == "jax_debug_nans":

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from radejax.core.config import base_config
+from radejax.config import Config
 from radejax.core.errors import DiskFullError, UserError
 from radejax.training import distributed, metric_logger
 from radejax.training.metric_logger import MetricLogger, Scores, log_results
@@ -24,8 +24,7 @@ def _steps(folder: pathlib.Path) -> list[int]:
 
 
 def _logger(folder: pathlib.Path, start: int, **logging: object) -> MetricLogger:
-    config = base_config()
-    config.logging.update(logging)
+    config = Config().replace(logging=logging)
     return MetricLogger(folder, config, start_step=start, num_steps=10)
 
 
@@ -80,8 +79,7 @@ def test_waiting_for_data_is_warned_of_once(
     text: str,
 ) -> None:
     monkeypatch.setattr(metric_logger, "usable_cpus", lambda: 7)
-    config = base_config()
-    config.data.num_threads = num_threads
+    config = Config().replace(data={"num_threads": num_threads})
     wait = threading.Event().wait
     with MetricLogger(tmp_path, config, start_step=0, num_steps=10) as logger:
         for step, seconds in ((1, 0.0), (2, 0.2), (3, 0.2)):
@@ -153,7 +151,7 @@ def test_weights_and_biases_copies_tensorboard_and_gets_the_config(
     assert first == second
     assert first["sync_tensorboard"]
     assert first["project"] == "p"
-    assert first["config"]["train"]["batch_size"] == base_config().train.batch_size
+    assert first["config"]["train"]["batch_size"] == Config().train.batch_size
     assert fake.init.return_value.finish.call_count == 2
 
 

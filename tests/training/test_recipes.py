@@ -8,17 +8,16 @@ import jax
 import numpy as np
 import pytest
 import safetensors.numpy
-from ml_collections import ConfigDict
 
 from radejax import models
-from radejax.core.config import load_module
+from radejax.config import Config, load_config
 from radejax.core.errors import UserError
 from radejax.core.structures import Batch, DetectionMaps
 from radejax.geometry.camera import stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.saved import starting_weights
-from radejax.losses.detection import detection_loss
-from radejax.runs import checks
+from radejax.losses.detection import LossOptions, detection_loss
+from radejax.models.options import DinoRadeOptions
 from radejax.training import loop
 from radejax.training.step import (
     create_state,
@@ -30,7 +29,6 @@ from radejax.weights import radenet_torch
 
 from ..small_models import calibration, drawn
 
-CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
 SIZE = (32, 576)  # the released crop leaves out 280 columns on both sides
 ALL = [
     *(("radenet", words) for words in ("", "paper", "official", "sedan", "stem")),
@@ -41,10 +39,6 @@ ALL = [
     *((name, "") for name in ("quickstart", "quickstart_fusion", "full_grid")),
     ("simulate_real_scenes", ""),
 ]
-
-
-def _get(name: str, words: str = "") -> Any:
-    return load_module(CONFIGS / f"{name}.py").get_config(words)
 
 
 @pytest.mark.parametrize(
@@ -69,7 +63,7 @@ def test_trainings_are_those_of_the_papers(
     classes: int,
     labels: str,
 ) -> None:
-    config = _get(name, words)
+    config = load_config(f"{name}:{words}")
     train = config.train
     assert (train.batch_size, train.num_epochs) == (batch, epochs)
     assert (len(config.classes), config.model.num_classes) == (classes, classes)
@@ -92,11 +86,10 @@ def test_trainings_are_those_of_the_papers(
 @pytest.mark.parametrize("name", ["radenet", "dinorade"])
 @pytest.mark.parametrize("preset", ["", "paper", "official"])
 def test_an_option_for_sigma_changes_only_the_targets(name: str, preset: str) -> None:
-    plain = _get(name, preset).to_dict()
+    plain = load_config(f"{name}:{preset}").to_dict()
     fixed = {"sigma3": 3.0, "sigma0.75": 0.75}
     for word in (*fixed, "adaptive", "anisotropic"):
-        config = _get(name, f"{preset},{word}").to_dict()
-        checks.check(ConfigDict(config))
+        config = load_config(f"{name}:{preset},{word}").to_dict()
         loss = config.pop("loss")
         assert loss["heatmap_sigma_mode"] == ("fixed" if word in fixed else word)
         assert loss["heatmap_sigma_bins"] == fixed.get(
@@ -106,7 +99,7 @@ def test_an_option_for_sigma_changes_only_the_targets(name: str, preset: str) ->
         assert loss | nothing == plain["loss"] | nothing
         assert config == {k: v for k, v in plain.items() if k != "loss"}
     with pytest.raises(UserError, match="exclude each other"):
-        _get(name, "sigma3,adaptive")
+        load_config(f"{name}:sigma3,adaptive")
 
 
 @pytest.mark.parametrize("name", ["radenet", "dinorade"])
@@ -114,9 +107,8 @@ def test_an_option_for_sigma_changes_only_the_targets(name: str, preset: str) ->
 def test_an_option_for_a_release_changes_only_the_input(
     name: str, release: str
 ) -> None:
-    plain = _get(name, "official,sedan").to_dict()
-    config = _get(name, f"official,sedan,{release}").to_dict()
-    checks.check(ConfigDict(config))
+    plain = load_config(f"{name}:official,sedan").to_dict()
+    config = load_config(f"{name}:official,sedan,{release}").to_dict()
     model = config["model"]
     # Half of K-Radar's noise and all echoes are positive.
     assert 0.5 <= model.pop("input_center") <= 0.52
@@ -140,12 +132,12 @@ def test_every_sigma_has_a_finite_gradient_of_its_own(tiny: Any) -> None:
 
     @jax.jit
     def focal(maps: DetectionMaps) -> Any:
-        def of(options: Any) -> Any:
+        def of(options: LossOptions) -> Any:
             return jax.value_and_grad(
-                lambda m: detection_loss(m, batch, tiny.map_grid, **options)[1]["focal"]
+                lambda m: detection_loss(m, batch, tiny.map_grid, options)[1]["focal"]
             )(maps)
 
-        return [of(_get("radenet", word).loss.to_dict()) for word in words]
+        return [of(load_config(f"radenet:{word}").loss) for word in words]
 
     found = focal(maps)
     chex.assert_tree_all_finite(found)
@@ -153,40 +145,39 @@ def test_every_sigma_has_a_finite_gradient_of_its_own(tiny: Any) -> None:
     assert all(np.abs(gradient.heatmap_logits).max() > 0 for _, gradient in found)
 
 
-def _shrink(config: Any) -> None:
+def _shrink(config: Config) -> Config:
     """The same choices on a sensor of 8 x 8 bins."""
     model = config.model
-    wide = model.decoder_width > model.widths[0]
-    model.update(
-        doppler_bins=5,
-        elevation_bins=4,
-        widths=(8, 8),
-        decoder_width=16 if wide else 8,
-        num_groups=4,
-        pad_multiple=4,
-    )
-    if model.heads == "default":
-        model.decoder_width = 8
-    if model.name == "dinorade":
-        model.image.update(
-            size=SIZE,
-            hidden_size=16,
-            num_layers=1,
-            num_heads=2,
-            mlp_dim=16,
-            num_registers=1,
-            resnet_width=4,
-        )
-        model.fusion.update(num_heads=2, num_elevation=3, chunk_size=16)
-        model.query_grid.update(
-            range_m=(2.0, 4.0), azimuth_deg=(-45.0, 12.0), elevation_deg=(-10.0, 10.0)
-        )
-    config.train.batch_size = 2
-    config.train.num_epochs = 2
-    config.train.warmup_steps = 0
+    is_wide = model.decoder_width > model.widths[0] and model.heads != "default"
+    changes: dict[str, Any] = {
+        "doppler_bins": 5,
+        "elevation_bins": 4,
+        "widths": (8, 8),
+        "decoder_width": 16 if is_wide else 8,
+        "num_groups": 4,
+        "pad_multiple": 4,
+    }
+    if isinstance(model, DinoRadeOptions):
+        changes["image"] = {
+            "size": SIZE,
+            "hidden_size": 16,
+            "num_layers": 1,
+            "num_heads": 2,
+            "mlp_dim": 16,
+            "num_registers": 1,
+            "resnet_width": 4,
+        }
+        changes["fusion"] = {"num_heads": 2, "num_elevation": 3, "chunk_size": 16}
+        changes["query_grid"] = {
+            "range_m": (2.0, 4.0),
+            "azimuth_deg": (-45.0, 12.0),
+            "elevation_deg": (-10.0, 10.0),
+        }
+    train = {"batch_size": 2, "num_epochs": 2, "warmup_steps": 0}
+    return config.replace(model=changes, train=train, simulation=None)
 
 
-def _batch(config: Any, grid: RadarGrid) -> Batch:
+def _batch(config: Config, grid: RadarGrid) -> Batch:
     rng = np.random.default_rng(0)
     boxes = np.zeros((2, 3, 8), np.float32)
     boxes[..., 0] = rng.uniform(5, 25, (2, 3))
@@ -198,7 +189,7 @@ def _batch(config: Any, grid: RadarGrid) -> Batch:
         is_valid=np.tile([True, True, False], (2, 1)),
         frame=np.arange(2, dtype=np.int32),
     )
-    if config.model.name != "dinorade":
+    if not isinstance(config.model, DinoRadeOptions):
         return batch
     camera = calibration(width=SIZE[1], height=SIZE[0]).camera(is_valid=True)
     return batch.replace(
@@ -212,9 +203,9 @@ def _batch(config: Any, grid: RadarGrid) -> Batch:
 def test_fine_tuning_starts_from_an_official_checkpoint(
     tiny: Any, workdir: pathlib.Path
 ) -> None:
-    config = tiny.config.copy_and_resolve_references()
     # A rate of nothing: what comes out is what went in.
-    config.train.update(num_epochs=1, learning_rate=1e-30, final_learning_rate=1e-31)
+    rates = {"learning_rate": 1e-30, "final_learning_rate": 1e-31}
+    config = tiny.config.replace(train={"num_epochs": 1} | rates)
     inputs = np.zeros((1, *tiny.grid.projection_shape), np.float32)
     official = jax.jit(tiny.model.init)(jax.random.key(99), inputs)
     path = workdir / "best.safetensors"
@@ -237,8 +228,7 @@ def test_fine_tuning_starts_from_an_official_checkpoint(
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "words"), ALL)
 def test_two_steps_of_every_config(name: str, words: str) -> None:
-    config = _get(name, words)
-    _shrink(config)
+    config = _shrink(load_config(f"{name}:{words}"))
     grid = RadarGrid.reduced(
         num_doppler=5, num_range=8, num_elevation=4, num_azimuth=8, max_range_m=30.0
     )
@@ -258,7 +248,7 @@ def test_two_steps_of_every_config(name: str, words: str) -> None:
             model,
             optimizer,
             models.map_grid(grid, model, config.data.azimuth_mapping),
-            loss=dict(config.loss),
+            loss=config.loss,
         )
     )
     state = start
@@ -271,5 +261,5 @@ def test_two_steps_of_every_config(name: str, words: str) -> None:
     )
     assert np.mean(jax.tree.leaves(changed)) > 0.9
     chex.assert_trees_all_equal(state.frozen, start.frozen)
-    has_frozen_part = config.model.name == "dinorade" and config.model.image.freeze
-    assert bool(start.frozen) == has_frozen_part
+    has_camera = isinstance(config.model, DinoRadeOptions)
+    assert bool(start.frozen) == (has_camera and config.model.image.freeze)

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.core.config import base_config
 from radejax.core.errors import UserError
+from radejax.training.options import TrainOptions
 from radejax.training.step import (
     create_state,
     make_optimizer,
@@ -20,15 +20,11 @@ from radejax.training.step import (
 )
 
 
-def _train(**fields: Any) -> Any:
-    train = base_config().train
-    train.update(fields)
-    return train
-
-
 def _schedule(steps_per_epoch: int, num_epochs: int = 1, **fields: Any) -> Any:
     rates = {"learning_rate": 1e-3, "final_learning_rate": 1e-4, "schedule": "cosine"}
-    train = _train(**rates | {"warmup_steps": 0, "num_epochs": num_epochs} | fields)
+    train = TrainOptions(
+        **rates | {"warmup_steps": 0, "num_epochs": num_epochs} | fields
+    )
     return make_schedule(train, steps_per_epoch)
 
 
@@ -98,13 +94,13 @@ def test_accumulated_steps_update_once_with_the_mean_and_at_the_rate_of_their_st
 ):
     rates = jnp.array([0.0, 1e-3, 2e-3, 3e-3])
     params, grads = {"w": jnp.array([2.0])}, [jnp.array([1.0]), jnp.array([3.0])]
-    train = _train(weight_decay=0.1, gradient_accumulation_steps=2)
+    train = TrainOptions(weight_decay=0.1, gradient_accumulation_steps=2)
     accumulating = make_optimizer(train, lambda step: rates[step])
     state = accumulating.init(params)
     for i in range(4):
         updates, state = accumulating.update({"w": grads[i % 2]}, state, params)
         assert (updates["w"][0] == 0) == (i != 3)  # the first update has a rate of 0
-    once = make_optimizer(_train(weight_decay=0.1), lambda step: rates[2 * step])
+    once = make_optimizer(TrainOptions(weight_decay=0.1), lambda step: rates[2 * step])
     expected = once.init(params)
     for _ in range(2):
         wanted, expected = once.update({"w": jnp.array([2.0])}, expected, params)
@@ -112,7 +108,7 @@ def test_accumulated_steps_update_once_with_the_mean_and_at_the_rate_of_their_st
 
 
 def test_first_step_is_adamw_with_torch_defaults() -> None:
-    optimizer = make_optimizer(_train(), lambda _: 1e-3)
+    optimizer = make_optimizer(TrainOptions(), lambda _: 1e-3)
     params = {"kernel": jnp.array([2.0, -3.0]), "bias": jnp.array([0.5])}
     grads = {"kernel": jnp.array([0.1, 4.0]), "bias": jnp.array([-1.0])}
     updates, _ = optimizer.update(grads, optimizer.init(params), params)
@@ -127,7 +123,7 @@ def test_first_step_is_adamw_with_torch_defaults() -> None:
 
 
 def test_frozen_parameters_have_no_update_and_no_optimizer_state() -> None:
-    optimizer = make_optimizer(_train(weight_decay=0.1), lambda _: 1e-3)
+    optimizer = make_optimizer(TrainOptions(weight_decay=0.1), lambda _: 1e-3)
     params = {
         "vit": {"kernel": jnp.ones((7, 5))},
         "head": {"kernel": jnp.ones((3,)), "fixed": jnp.ones((2,))},
@@ -148,7 +144,7 @@ def test_frozen_parameters_have_no_update_and_no_optimizer_state() -> None:
 
 
 def test_eval_variables_are_the_averaged_ones_where_there_are_any() -> None:
-    optimizer = make_optimizer(_train(weight_decay=0.0), lambda _: 1e-3)
+    optimizer = make_optimizer(TrainOptions(weight_decay=0.0), lambda _: 1e-3)
     variables = {"params": {"w": jnp.ones(2)}, "batch_stats": {"mean": jnp.zeros(2)}}
     state = create_state(variables, optimizer, use_ema=True)
     state = state.replace(ema_params={"w": jnp.full(2, 5.0)})

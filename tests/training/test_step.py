@@ -39,7 +39,7 @@ def step(tiny: Tiny, start: tuple[Any, Any]) -> Any:
 
 
 def _make(tiny: Tiny, optimizer: Any, **options: Any) -> Any:
-    options = {"loss": dict(tiny.config.loss), "ema_decay": 0.9} | options
+    options = {"loss": tiny.config.loss, "ema_decay": 0.9} | options
     return make_train_step(tiny.model, optimizer, tiny.map_grid, **options)
 
 
@@ -155,10 +155,10 @@ def test_bfloat16_keeps_parameters_moments_and_losses_in_float32(
 ) -> None:
     optimizer, state = start
     narrow = make_train_step(
-        tiny.model.clone(dtype="bfloat16"),
+        tiny.model.clone(options=tiny.model.options.replace(dtype="bfloat16")),
         optimizer,
         tiny.map_grid,
-        loss=dict(tiny.config.loss),
+        loss=tiny.config.loss,
         ema_decay=0.9,
     )
     after, metrics = jax.eval_shape(narrow, state, _batch(tiny), RNG)

@@ -17,14 +17,14 @@ import numpy as np
 import pytest
 
 from radejax import models
-from radejax.core.config import load_module
+from radejax.config import Config, load_config, load_module
 from radejax.core.structures import CLASSES, Batch, DetectionMaps
 from radejax.geometry.camera import CameraCalibration, stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.saved import load_torch
 from radejax.models.lifting import OFFICIAL_OFFSET_M
+from radejax.models.vit import ViT
 from radejax.training import distributed
-from radejax.training.loop import loss_options
 from radejax.training.step import (
     TrainState,
     create_state,
@@ -34,7 +34,6 @@ from radejax.training.step import (
 )
 from radejax.weights import dinov3_hf, radenet_torch
 
-CONFIGS = pathlib.Path(__file__).resolve().parents[2] / "configs"
 SEED = 1234
 LOSSES = ("focal", "gwd", "smooth_l1", "grad_norm")
 STEPS_PER_EPOCH = 3
@@ -64,13 +63,13 @@ def frames(shared: pathlib.Path) -> Batch:
 
 
 def train(
-    config: Any, model: Any, variables: Any, batch: Batch, num_steps: int
+    config: Config, model: Any, variables: Any, batch: Batch, num_steps: int
 ) -> tuple[TrainState, Measured]:
     """State after batches of two in order, and what each step measured."""
-    config.train.batch_size = 2
-    config.train.num_epochs = -(-num_steps // STEPS_PER_EPOCH)
-    schedule = make_schedule(config.train, STEPS_PER_EPOCH)
-    optimizer = make_optimizer(config.train, schedule)
+    num_epochs = -(-num_steps // STEPS_PER_EPOCH)
+    options = config.train.replace(batch_size=2, num_epochs=num_epochs)
+    schedule = make_schedule(options, STEPS_PER_EPOCH)
+    optimizer = make_optimizer(options, schedule)
     grid = models.map_grid(RadarGrid.kradar(), model, config.data.azimuth_mapping)
     mesh = distributed.make_mesh(1)
     state = create_state(
@@ -81,7 +80,9 @@ def train(
     )
     placement = distributed.state_sharding(state, mesh, "replicated")
     state = jax.device_put(state, placement)
-    step = make_train_step(model, optimizer, grid, loss=loss_options(config))
+    step = make_train_step(
+        model, optimizer, grid, loss=config.loss, decoding=config.decode
+    )
     step = jax.jit(step, donate_argnums=0, out_shardings=(placement, None))
     measured, rng = [], jax.random.key(1)
     for i in range(num_steps):
@@ -141,7 +142,7 @@ def check_stats(
 def test_radenet_trains_as_released(
     shared: pathlib.Path, frames: Batch, make: types.ModuleType
 ) -> None:
-    config = load_module(CONFIGS / "radenet.py").get_config("official")
+    config = load_config("radenet:official")
     model = models.build(config.model)
     tensors = {
         n: make.seeded_tensor(n, s)
@@ -217,14 +218,18 @@ NO_GRADIENT = [f"image_neck.{n}.0.bias" for n in ("fpn_layer1", "fpn_layer2", "r
 def test_dinorade_trains_as_released(
     shared: pathlib.Path, frames: Batch, make: types.ModuleType
 ) -> None:
-    config = load_module(CONFIGS / "dinorade.py").get_config("official")
+    config = load_config("dinorade:official")
     # The fixture's settings where they are not the release's.
-    config.model.fusion.update(num_points=4, necks=False, dropout=0.0)
-    config.train.final_learning_rate = config.train.learning_rate
+    config = config.replace(
+        model={"fusion": {"num_points": 4, "necks": False, "dropout": 0.0}},
+        train={"final_learning_rate": config.train.learning_rate},
+    )
     model = models.build(config.model)
     tensors = seeded(shared, make, "dinorade/end_to_end")
     variables = load_torch(tensors).variables
-    backbone = dinov3_hf.to_params(model.vit, seeded(shared, make, "dinov3/vits16"))
+    backbone = dinov3_hf.to_params(
+        ViT(model.options.image), seeded(shared, make, "dinov3/vits16")
+    )
     variables["params"]["image_backbone"] = backbone
     calibration = CameraCalibration.from_kradar(
         shared / "data/kradar/calib/common/cam_front0.yml",

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.core.config import load_config, load_module
+from radejax.config import load_config, load_module
 from radejax.core.errors import DataError, UserError
 from radejax.geometry.camera import CameraCalibration
 from radejax.inference.saved import load_torch
@@ -19,10 +19,10 @@ from radejax.models.fusion import Fusion
 from radejax.models.image import CameraNeck
 from radejax.models.lifting import (
     OFFICIAL_OFFSET_M,
-    LiftingAxes,
     WeightingNetwork,
     reference_points,
 )
+from radejax.models.options import OFFICIAL_DINORADE, ViTOptions
 from radejax.models.vit import ViT
 from radejax.weights import dinorade_torch, dinov3_hf
 from radejax.weights.convert import (
@@ -72,7 +72,8 @@ def released_geometry(shared):
         radar_from_lidar_m=OFFICIAL_OFFSET_M,
     )
     camera = calibration.camera("pinhole")
-    return reference_points(camera, LiftingAxes.official(), 256, 112, "official")
+    axes = OFFICIAL_DINORADE.query_grid
+    return reference_points(camera, axes, 256, 112, 10, "official")
 
 
 def channels_last(x):
@@ -112,24 +113,24 @@ def test_released_camera_neck(shared):
 def test_released_fusion(shared):
     file = np.load(shared / "fixtures" / "dinorade" / "fusion.npz")
     tensors = part(shared, "fusion", "fusion.")
-    fields = load_config("dinorade:official").model.fusion.to_dict()
-    fields |= dinorade_torch.infer_fusion(tensors, {})
+    fields = dinorade_torch.infer_fusion(tensors, {})
     assert fields["weighting"] == "cnn"
     assert not fields["necks"]
+    module = Fusion(OFFICIAL_DINORADE.fusion.replace(**fields))
     radar = channels_last(RECIPES.normal_input(122, (1, 128, 256, 112)))
     camera = channels_last(RECIPES.normal_input(123, (1, 128, 180, 320)))
     elevation = np.pad(radar_cube()[..., 64:], ((0, 0), (0, 0), (0, 5), (0, 0)))
     reference = released_geometry(shared)
 
     inputs = radar, elevation, camera, reference
-    shapes = jax.eval_shape(Fusion(**fields).init, jax.random.key(0), *inputs)
+    shapes = jax.eval_shape(module.init, jax.random.key(0), *inputs)
     variables = part_from_torch(
         "image_fusion", shapes, tensors, "fusion", r"fusion\.output_proj"
     )
 
     @jax.jit
     def run(variables, *inputs):
-        return Fusion(**fields).apply(variables, *inputs, mutable="intermediates")
+        return module.apply(variables, *inputs, mutable="intermediates")
 
     out, state = run(variables, *inputs)
     out, gate = np.asarray(out[0]), state["intermediates"]["camera_share"][0][0]
@@ -172,8 +173,9 @@ def test_loading_fills_the_model_exactly(shared):
     tensors = end_to_end_tensors(shared)
     nested = {"epoch": 3, "model": {f"module.{k}": v for k, v in tensors.items()}}
     model, variables = load(nested, crop_output=True, num_heads=8)
-    assert model.crop_output
-    assert (model.fusion.num_heads, model.fusion.num_points) == (8, 2)
+    assert model.options.crop_output
+    fusion = model.options.fusion
+    assert (fusion.num_heads, fusion.num_points) == (8, 2)
     reference = jax.eval_shape(lambda: released_geometry(shared))
     expected = jax.eval_shape(
         model.init,
@@ -208,7 +210,7 @@ def test_image_backbone_with_adapters(tiny, make):
     tensors[f"{query}.lora_A.default.weight"] = down
     tensors[f"{query}.lora_B.default.weight"] = up
     model, variables = load(tensors)
-    vit = model.vit
+    vit = model.options.image
     sizes = vit.hidden_size, vit.num_layers, vit.num_heads, vit.mlp_dim
     assert sizes == (96, 3, 1, 192)
     backbone = variables["params"]["image_backbone"]
@@ -226,20 +228,21 @@ def test_a_folder_in_place_of_the_backbone(tiny, make, tmp_path):
     loaded = load_torch({"epoch": 1, "model": tiny}, image_backbone=folder)
     assert loaded.config.data.camera.projection == "pinhole"
     vit, expected = dinov3_hf.load(folder)
-    assert loaded.model.vit == vit
+    fields = dinov3_hf.image_fields(loaded.model.options.image)
+    assert fields == dinov3_hf.image_fields(vit.options)
     found = loaded.variables["params"]["image_backbone"]
     chex.assert_trees_all_equal(found, expected["params"])
 
 
 def test_dinov2_in_place_of_the_backbone_is_rejected(tiny, monkeypatch):
-    vit = ViT(patch_size=14, position_grid=37)
+    vit = ViT(ViTOptions(patch_size=14, position_grid=37))
     monkeypatch.setattr(dinov3_hf, "load", lambda path: (vit, {"params": {}}))
     with pytest.raises(UserError, match="folder is 'DINOv2', expected DINOv3 as in"):
         load(tiny, image_backbone="folder")
 
 
 def test_other_content_is_rejected(shared, tmp_path):
-    with pytest.raises(UserError, match="depth is not a field of this model"):
+    with pytest.raises(UserError, match=r"config\.model\.depth is not a field"):
         load(end_to_end_tensors(shared), depth=3)
     with pytest.raises(DataError, match=r"tensors backbone\.\* or rad_backbone\.\*"):
         load({"start_conv.weight": np.zeros(3)})
@@ -265,8 +268,8 @@ def test_resnet_in_place_of_the_transformer(shared):
     assert expected["image_backbone.frozen_layers.0.weight"].shape == (64, 3, 7, 7)
     assert expected["image_backbone.projection.weight"].shape == (128, 2048, 1, 1)
     loaded, variables = load(tensors | expected)
-    assert loaded.vit is None
-    assert not loaded.standardize_image
+    image = loaded.options.image
+    assert (image.kind, image.standardize) == ("resnet50", False)
     kernel = variables["params"]["image_neck"]["block_2"]["conv_2"]["kernel"]
     theirs = expected["image_backbone.layer4.1.conv2.weight"]
     np.testing.assert_array_equal(kernel[0, 2, 5, 7], theirs[7, 5, 0, 2])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import safetensors.numpy
 
-from radejax.core.config import load_module
+from radejax.config import load_module
 from radejax.core.errors import DataError, UserError
 from radejax.weights import dinov3_hf
 
@@ -231,8 +231,8 @@ def test_features_of_the_original_code(sources, name, tmp_path):
     tensors, config = description(sources, name)
     path = write(tmp_path, name, tensors, config)
     model, variables = dinov3_hf.load(path)
-    assert model.gated_mlp == ("swiglu" in name)
-    assert model.position_grid == (4 if "dinov2" in name else 0)
+    assert model.options.gated_mlp == ("swiglu" in name)
+    assert model.options.position_grid == (4 if "dinov2" in name else 0)
     sizes = [key.split("__")[1] for key in arrays if key.startswith(f"{name}__")]
     assert len(sizes) == (3 if "dinov2" in name else 2)
     for size in sizes:
@@ -348,7 +348,7 @@ def test_rounded_wavelengths_are_those_of_the_base_100(sources, tmp_path):
     )
     rounded = np.float32([1, 3.15625, 10, 31.625])  # to bfloat16
     path = write(tmp_path, "meta", tensors | {"rope_embed.periods": rounded}, config)
-    assert dinov3_hf.load(path)[0].num_heads == 2
+    assert dinov3_hf.load(path)[0].options.num_heads == 2
 
 
 def test_only_dinov3_is_written(sources, tmp_path):

@@ -5,9 +5,10 @@ import jax
 import numpy as np
 import pytest
 
-from radejax.core.config import load_config
+from radejax.config import load_config
 from radejax.core.errors import UserError
 from radejax.models import build
+from radejax.models.vit import ViT
 from radejax.weights import dinov3_hf, image_backbone
 
 TRUNK = {"stem": np.arange(3.0)}
@@ -48,7 +49,7 @@ def test_embeddings_stand_for_all_of_a_transformer():
 
 def test_weights_of_another_transformer_are_rejected(monkeypatch):
     model = build(load_config("dinorade").model)
-    found = model.vit.clone(num_registers=3)
+    found = ViT(model.options.image.replace(num_registers=3))
     monkeypatch.setattr(dinov3_hf, "load", lambda path: (found, {"params": TRUNK}))
     with pytest.raises(UserError, match="num_registers is 3 there and 4 here"):
         image_backbone.load_image_backbone("folder", model)
@@ -56,7 +57,7 @@ def test_weights_of_another_transformer_are_rejected(monkeypatch):
         UserError, match="folder is DINOv3, another backbone than config"
     ):
         image_backbone.load_image_backbone("folder", model)
-    same = model.vit.clone(attention="xla", layer_scale=0.5)
+    same = ViT(model.options.image.replace(attention="xla", layer_scale=0.5))
     monkeypatch.setattr(dinov3_hf, "load", lambda path: (same, {"params": TRUNK}))
     loaded = image_backbone.load_image_backbone("folder", model)
     assert loaded == {"params": {"image_backbone": TRUNK}}
@@ -66,7 +67,7 @@ def test_weights_of_another_transformer_are_rejected(monkeypatch):
 def test_dinov2_and_dinov3_are_told_apart(monkeypatch, given):
     configs = {"DINOv3": "dinorade", "DINOv2": "dinorade:rcw_dinov2"}
     models = {kind: build(load_config(name).model) for kind, name in configs.items()}
-    found = models.pop(given).vit
+    found = ViT(models.pop(given).options.image)
     (model,) = models.values()
     monkeypatch.setattr(dinov3_hf, "load", lambda path: (found, {"params": TRUNK}))
     with pytest.raises(UserError, match=rf"is {given}, .*position_grid is \d+ there"):
@@ -78,7 +79,9 @@ def test_dinov2_small_has_the_sizes_of_its_config():
     # facebook/dinov2-small: 14 x 14 pixels per patch, pretrained at 518 x 518 pixels.
     assert model.feature_shape == (51, 91, 384)
     shapes = jax.eval_shape(
-        model.vit.init, jax.random.key(0), np.zeros((1, 28, 28, 3), np.float32)
+        ViT(model.options.image).init,
+        jax.random.key(0),
+        np.zeros((1, 28, 28, 3), np.float32),
     )
     count = sum(leaf.size for leaf in jax.tree.leaves(shapes))
     # 22,056,576 parameters, of which a mask token and the biases of the keys are not needed.

@@ -17,6 +17,7 @@ import safetensors.numpy
 from radejax import models
 from radejax.core.errors import DataError, UserError
 from radejax.inference.saved import load_torch
+from radejax.models.options import RadeNetOptions
 from radejax.models.radenet import RadeNet
 from radejax.weights import radenet_torch
 from radejax.weights.convert import torch_name
@@ -33,7 +34,7 @@ def recipe(golden):
 @pytest.fixture(scope="module")
 def small_state(recipe):
     """Seeded state dict of the small model in official names."""
-    model = models.build(recipe["SMALL"])
+    model = models.build(RadeNetOptions(**recipe["SMALL"]))
     return recipe["seeded_state"](torch_shapes(model))
 
 
@@ -47,8 +48,9 @@ OVERRIDES = {"num_groups": 8, "doppler_bins": 8, "elevation_bins": 5}
 
 
 def load_variant(recipe, variant):
-    config = recipe["SMALL"] | recipe["VARIANTS"][variant]
-    model = models.build(config)
+    # PyTorch's model has None for no attention.
+    changes = {k: x or "off" for k, x in recipe["VARIANTS"][variant].items()}
+    model = models.build(RadeNetOptions(**recipe["SMALL"] | changes))
     state = recipe["seeded_state"](torch_shapes(model))
     overrides = OVERRIDES | ({"cbam": "paper"} if variant == "paper" else {})
     return model, *load(state, **overrides)
@@ -163,8 +165,8 @@ def test_all_problems_are_listed(small_state):
 
 
 def test_released_models_without_cbam_still_have_its_tensors(small_state, recipe):
-    model, variables = load(small_state, cbam=None, **OVERRIDES)
-    assert model.cbam is None
+    model, variables = load(small_state, cbam="off", **OVERRIDES)
+    assert model.options.cbam == "off"
     assert not any("cbam" in name for name in variables["params"]["backbone"])
     saved = radenet_torch.save(model, variables)
     assert saved.keys() == small_state.keys()
@@ -198,7 +200,7 @@ def test_something_else_is_rejected(content, message):
 
 
 def test_overrides_are_checked(small_state):
-    with pytest.raises(UserError, match="width is not a field of this model"):
+    with pytest.raises(UserError, match=r"config\.model\.width is not a field"):
         load(small_state, width=3, **OVERRIDES)
     with pytest.raises(UserError, match=r"give doppler_bins and elevation_bins"):
         load(small_state, num_groups=8)
@@ -217,7 +219,7 @@ def load_official(shared, recipe, variant):
         (shared / f"fixtures/radenet/{variant}_params.json").read_text()
     )
     shapes = {e["name"]: tuple(e["shape"]) for e in listing["tensors"]}
-    overrides = {"cbam": None} if variant in ("base", "no_cbam") else {}
+    overrides = {"cbam": "off"} if variant in ("base", "no_cbam") else {}
     return load(recipe["seeded_state"](shapes), **overrides)
 
 
@@ -317,7 +319,7 @@ def test_names_and_shapes_are_the_official_ones(variant, shared):
         (shared / f"fixtures/radenet/{variant}_params.json").read_text()
     )
     expected = {e["name"]: tuple(e["shape"]) for e in listing["tensors"]}
-    assert torch_shapes(RadeNet(5, **VARIANTS[variant])) == expected
+    assert torch_shapes(RadeNet(RadeNetOptions(**VARIANTS[variant]))) == expected
 
 
 def test_a_module_of_another_model_has_no_name():

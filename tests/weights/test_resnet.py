@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from radejax import models
+from radejax.config import load_config
 from radejax.core.archives import read_safetensors
-from radejax.core.config import load_config
 from radejax.core.errors import DataError
 from radejax.models.image import ResNetNeck, ResNetTrunk
 from radejax.weights.image_backbone import load_resnet, save_resnet
@@ -150,7 +150,8 @@ def test_a_trunk_by_itself_is_written_and_read(tmp_path):
     )
     path = tmp_path / "resnet50.safetensors"
     save_resnet(params, path)
-    loaded = load_resnet(path, MODEL.clone(resnet_width=4))
+    narrow = MODEL.options.replace(image={"resnet_width": 4})
+    loaded = load_resnet(path, models.build(narrow))
     assert loaded.keys() == {"params"}
     chex.assert_trees_all_equal(loaded["params"], {"image_backbone": params})
     # Its names are torchvision's: what another program would look for.

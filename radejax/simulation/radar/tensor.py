@@ -11,19 +11,21 @@ accelerators, so that computing the projections of a full-size frame does not ne
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import itertools
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pydantic
+from annotated_types import Ge, Le
 from flax import struct
 from jax import lax
 from jaxtyping import Float, UInt32
 
-from radejax.core.errors import check_options, integer, number, require
+from radejax.core.errors import require
+from radejax.core.options import Count, Fraction, NotNegative, Options
 from radejax.core.structures import Array
 from radejax.data.projection import LOG_OFFSET_DB, LOG_SCALE_DB, POWER_FLOOR
 from radejax.geometry.radar_grid import RadarGrid
@@ -36,120 +38,92 @@ TESSERACT_OF_ROWS = (2, 0, 1, 3)
 """Permutation of the axes from rows `[R, E, D, A]` to a tesseract `[D, R, E, A]`."""
 
 
-def _is_profile(points: Any) -> bool:
-    """Returns True for pairs of a range in m and a level in dB, at ascending ranges."""
-    (is_range, _), (is_level, _) = number(0), number(-200, 200)
-    return all(
-        len(pair) == 2 and is_range(pair[0]) and is_level(pair[1]) for pair in points
-    ) and all(near[0] < far[0] for near, far in itertools.pairwise(points))
+Level = Annotated[float, Ge(-1e3), Le(1e3)]
+Elements = Annotated[float, Ge(1), Le(512)]
 
-
-_DRAWN_RANGES = {
-    "gain_db": number(-1e3, 1e3),
-    "noise_db": number(-1e3, 1e3),
-    "receiver_db": number(-100, 100),
-    "range_profile": number(0, 2),
-    "high_pass_m": number(0, 1e3),
-    "leakage": number(0, 0.5),
-    "range_correlation": number(0, 4 / 9),
-    "beam_spread_db": number(0, 3),
-    "ground_clutter": number(0, 1),
-}
-_RANGES = _DRAWN_RANGES | {
-    "gain_doppler_bins": integer(0),
-    "profile_db": (_is_profile, "pairs of range in m and level in dB, by range"),
-    "wavelength_m": number(1e-4, 1),
-    "azimuth_elements": number(1, 512),
-    "elevation_elements": number(1, 512),
-    "array_pedestal": number(0, 1),
-    "doppler_pedestal": number(0, 1),
-    "range_resolution_m": number(0, 100),
-    "pattern_exponent": number(0, 100),
-    "max_scatterers_per_row": integer(1, 4096),
-}
-
-DRAWN = frozenset(_DRAWN_RANGES)
+DRAWN = frozenset(
+    (
+        *("gain_db", "noise_db", "receiver_db", "range_profile", "high_pass_m"),
+        *("leakage", "range_correlation", "beam_spread_db", "ground_clutter"),
+    )
+)
 """Fields of `RadarParameters` that can differ between sequences."""
 
 
-@dataclasses.dataclass(frozen=True)
-class RadarParameters:
+class RadarParameters(Options, section="config.simulation.radar"):
     """Parameters of the sensor other than its axes.
 
     Instances are hashable and can be static arguments of `jax.jit`. K-Radar publishes no
     link budget. The defaults are those of an ideal sensor. Gain and noise are set so that
     the noise lies near the middle of the normalized scale of the tensor projection and a
     car at 5 m near its upper end. `radejax.simulation.config.PRESETS` has other sensors.
-
-    Attributes:
-        gain_db: Received power in dB from a target of 0 dBsm at 1 m on boresight, without
-            the high-pass filter.
-        gain_doppler_bins: Number of Doppler bins for which the gain is given. Fewer bins
-            integrate fewer chirps, so the gain is less; 0 for the same gain of all numbers.
-        noise_db: Mean noise power per cell in dB.
-        receiver_db: Gain of the receiver in dB, which amplifies echoes and noise.
-        range_profile: Factor on the profile over range in dB that K-Radar's noise has: the
-            direct leak into the first bins, a dip, a decay before the last bins and a rise
-            in them. 0 for noise of the same power at all ranges.
-        profile_db: Range in m and noise in dB relative to `noise_db` at ascending ranges,
-            as `fit_radar` estimates them; empty for the profile of K-Radar.
-        high_pass_m: Range below which the receiver's high-pass filter attenuates echoes by
-            40 dB per decade, as much as echoes become stronger; 0 for no filter.
-        leakage: Mean power of an echo in beams away from it, relative to its peak. It is
-            due to phase errors of the array's channels. 0 for an ideal array.
-        range_correlation: Correlation of the noise power in neighboring range bins. The
-            window of the range axis follows from it: 4/9 is a Hann window, less a higher
-            pedestal. 0 for a Hann window and independent noise.
-        beam_spread_db: Standard deviation over azimuth of the beams' gain in dB.
-        ground_clutter: Mean radar cross-section of the ground and roadside in m2 per m2,
-            whose many echoes have the statistics of noise.
-        wavelength_m: Carrier wavelength, by default at 77 GHz.
-        azimuth_elements: Number of elements of the virtual array in azimuth, at a spacing
-            of half a wavelength.
-        elevation_elements: Number of elements of the virtual array in elevation, at the
-            same spacing.
-        array_pedestal: Taper of the array, from 0 (Hann window) to 1 (uniform window).
-        doppler_pedestal: Window of the Doppler axis, likewise.
-        range_resolution_m: Width of a range bin of the FFT, or 0 for the grid's bins.
-        pattern_exponent: Exponent of the two-way antenna gain `cos(angle) ** exponent`.
-        max_scatterers_per_row: Maximum number of scatterers summed in one range row.
-            Only the strongest ones are summed.
-        ranges: Name, lowest and highest value of the fields of `DRAWN` of which each
-            sequence has its own value.
-
-    Raises:
-        UserError: A value is out of its range.
     """
 
-    gain_db: float = 178.0
-    gain_doppler_bins: int = 0
-    noise_db: float = 95.0
-    receiver_db: float = 0.0
-    range_profile: float = 0.0
-    profile_db: tuple[tuple[float, float], ...] = ()
-    high_pass_m: float = 0.0
-    leakage: float = 0.0
-    range_correlation: float = 0.0
-    beam_spread_db: float = 0.0
-    ground_clutter: float = 0.0
-    wavelength_m: float = 0.0039
-    azimuth_elements: float = 48.0
-    elevation_elements: float = 16.0
-    array_pedestal: float = 0.2
-    doppler_pedestal: float = 0.0
-    range_resolution_m: float = 0.0
-    pattern_exponent: float = 3.0
-    max_scatterers_per_row: int = 96
+    gain_db: Level = 178.0
+    """Received power in dB from a target of 0 dBsm at 1 m on boresight, without the
+    high-pass filter."""
+    gain_doppler_bins: Count = 0
+    """Number of Doppler bins for which the gain is given. Fewer bins integrate fewer chirps,
+    so the gain is less; 0 for the same gain of all numbers."""
+    noise_db: Level = 95.0
+    """Mean noise power per cell in dB."""
+    receiver_db: Annotated[float, Ge(-100), Le(100)] = 0.0
+    """Gain of the receiver in dB, which amplifies echoes and noise."""
+    range_profile: Annotated[float, Ge(0), Le(2)] = 0.0
+    """Factor on the profile over range in dB that K-Radar's noise has: the direct leak into
+    the first bins, a dip, a decay before the last bins and a rise in them. 0 for noise of
+    the same power at all ranges."""
+    profile_db: tuple[tuple[NotNegative, Annotated[float, Ge(-200), Le(200)]], ...] = ()
+    """Range in m and noise in dB relative to `noise_db` at ascending ranges, as `fit_radar`
+    estimates them; empty for the profile of K-Radar."""
+    high_pass_m: Annotated[float, Ge(0), Le(1e3)] = 0.0
+    """Range below which the receiver's high-pass filter attenuates echoes by 40 dB per
+    decade, as much as echoes become stronger; 0 for no filter."""
+    leakage: Annotated[float, Ge(0), Le(0.5)] = 0.0
+    """Mean power of an echo in beams away from it, relative to its peak. It is due to phase
+    errors of the array's channels. 0 for an ideal array."""
+    range_correlation: Annotated[float, Ge(0), Le(4 / 9)] = 0.0
+    """Correlation of the noise power in neighboring range bins. The window of the range axis
+    follows from it: 4/9 is a Hann window, less a higher pedestal. 0 for a Hann window and
+    independent noise."""
+    beam_spread_db: Annotated[float, Ge(0), Le(3)] = 0.0
+    """Standard deviation over azimuth of the beams' gain in dB."""
+    ground_clutter: Fraction = 0.0
+    """Mean radar cross-section of the ground and roadside in m2 per m2, whose many echoes
+    have the statistics of noise."""
+    wavelength_m: Annotated[float, Ge(1e-4), Le(1)] = 0.0039
+    """Carrier wavelength, by default at 77 GHz."""
+    azimuth_elements: Elements = 48.0
+    """Number of elements of the virtual array in azimuth, at a spacing of half a
+    wavelength."""
+    elevation_elements: Elements = 16.0
+    """Number of elements of the virtual array in elevation, at the same spacing."""
+    array_pedestal: Fraction = 0.2
+    """Taper of the array, from 0 (Hann window) to 1 (uniform window)."""
+    doppler_pedestal: Fraction = 0.0
+    """Window of the Doppler axis, likewise."""
+    range_resolution_m: Annotated[float, Ge(0), Le(100)] = 0.0
+    """Width of a range bin of the FFT, or 0 for the grid's bins."""
+    pattern_exponent: Annotated[float, Ge(0), Le(100)] = 3.0
+    """Exponent of the two-way antenna gain `cos(angle) ** exponent`."""
+    max_scatterers_per_row: Annotated[int, Ge(1), Le(4096)] = 96
+    """Maximum number of scatterers summed in one range row. Only the strongest ones are
+    summed."""
     ranges: tuple[tuple[str, float, float], ...] = ()
+    """Name, lowest and highest value of the fields of `DRAWN` of which each sequence has its
+    own value."""
 
-    def __post_init__(self) -> None:
-        section = "config.simulation.radar"
-        check_options(vars(self), section, _RANGES)
+    @pydantic.model_validator(mode="after")
+    def _check(self) -> RadarParameters:
+        ascends = all(a[0] < b[0] for a, b in itertools.pairwise(self.profile_db))
+        name = f"{self.section}.profile_db"
+        require(ascends, name, self.profile_db, "ascending ranges")
         for name, low, high in self.ranges:
             for end in (low, high):
-                check_options(vars(self) | {name: end}, section, _RANGES)
+                self.replace(**{"ranges": (), name: end})
             order = "the lower number first"
-            require(low <= high, f"{section}.{name}", (low, high), order)
+            require(low <= high, f"{self.section}.{name}", (low, high), order)
+        return self
 
     def draw(self, rng: np.random.Generator, num_doppler: int) -> RadarParameters:
         """Returns the parameters of one sequence for a number of Doppler bins.
@@ -163,7 +137,10 @@ class RadarParameters:
             share = max(num_doppler, 1) / self.gain_doppler_bins
             drawn["gain_db"] = drawn.get("gain_db", self.gain_db) + 10 * np.log10(share)
         changes = {"ranges": (), "gain_doppler_bins": 0, **drawn}
-        return dataclasses.replace(self, **changes)
+        return self.replace(**changes)
+
+
+IDEAL = RadarParameters()
 
 
 class SensorState(struct.PyTreeNode):
@@ -279,7 +256,7 @@ def simulate(
     state: SensorState | None = None,
     *,
     grid: RadarGrid,
-    parameters: RadarParameters = RadarParameters(),
+    parameters: RadarParameters = IDEAL,
     output: Output = "projection",
 ) -> Float[jax.Array, "..."]:
     """Simulates one radar frame. The function is jitted and supports `jax.vmap`.

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from radejax.core.errors import DataError, UserError
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.simulation.config import SimulationConfig, default_config
+from radejax.simulation.config import SimulationOptions
 from radejax.simulation.radar import sensor, tensor
 from radejax.simulation.radar.fit import fit_radar
 from radejax.simulation.radar.tensor import RadarParameters
@@ -101,8 +101,7 @@ def test_what_was_found_is_simulated_again():
     power, _ = recording(leakage=0.05, range_correlation=0.3, azimuth_elements=40.0)
     found = fit_radar([power], GRID)
     fields = json.loads(json.dumps(found))
-    section = default_config() | {"radar": fields, "frames_per_sequence": 1}
-    config = SimulationConfig.from_mapping(section)
+    config = SimulationOptions(radar=fields, frames_per_sequence=1)
     parameters = config.make_parameters()
     assert parameters.profile_db == tuple(map(tuple, found["profile_db"]))
     hash(parameters)  # a static argument

@@ -2,34 +2,25 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.simulation.config import SimulationConfig, default_config
+from radejax.simulation.config import SimulationOptions
 from radejax.simulation.radar import propagation, sensor, tensor
 from radejax.simulation.radar.tensor import DRAWN, RadarParameters
 from radejax.simulation.simulator import SequenceSimulator, make_source
 
 from .test_tensor import points
 
-REALISTIC = default_config() | {
-    "radar": default_config()["radar"] | {"preset": "realistic"}
-}
 GRID = RadarGrid.reduced(
     num_doppler=16, num_range=64, num_elevation=9, num_azimuth=56, max_range_m=118.0
 )
 NOTHING = points(10.0, amplitude=0.0)
 
 
-def config_of(**changes):
-    return SimulationConfig.from_mapping(REALISTIC | changes)
-
-
 def simulators(count, **changes):
-    config = config_of(train_sequences=count, test_sequences=0, **changes)
+    config = SimulationOptions(train_sequences=count, test_sequences=0, **changes)
     source = make_source(config)
     for number in source.numbers:
         yield SequenceSimulator(
@@ -79,7 +70,7 @@ class TestDraws:
         assert len({m.parameters for m in simulators(3)}) == 1  # static arguments
 
     def test_an_ideal_sensor_has_no_state(self):
-        config = config_of(radar={"preset": "ideal"})
+        config = SimulationOptions(radar={"preset": "ideal"})
         assert config.make_parameters() == RadarParameters()
         assert (
             sensor.draw_state(GRID, RadarParameters(), np.random.default_rng()) is None
@@ -281,4 +272,4 @@ def test_statistics_of_the_coarse_sensor_are_near_those_of_the_real_map():
     assert -6.0 < dip < 6.0
     assert -7.0 < end < -2.0
     assert -20.0 < np.median(leakage) < -9.0
-    assert len({dataclasses.astuple(s) for s in states}) == 8
+    assert len(set(states)) == 8

@@ -211,7 +211,7 @@ class TestPhysics:
             num_doppler=16, num_range=63, num_elevation=9, num_azimuth=24,
             max_range_m=31.0,
         )  # fmt: skip
-        sharp = dataclasses.replace(PARAMETERS, range_resolution_m=1.0)
+        sharp = PARAMETERS.replace(range_resolution_m=1.0)
         coarse_energy = tesseract(points(15.3)).sum() * GRID.range_step_m
         fine_energy = (
             tesseract(
@@ -402,7 +402,7 @@ class TestOutputs:
         np.testing.assert_allclose(batch[1], one(keys[1]), atol=1e-5)
 
     def test_dropping_the_weakest_scatterers_changes_little(self):
-        few = dataclasses.replace(PARAMETERS, max_scatterers_per_row=40)
+        few = PARAMETERS.replace(max_scatterers_per_row=40)
         noise = np.full((32, 16), 1e9, np.float32)
         all_power = tesseract(self.scene(), noise=noise)
         some_power = tesseract(self.scene(), noise=noise, parameters=few)

@@ -8,7 +8,7 @@ import pytest
 from radejax.core.errors import UserError
 from radejax.data.kradar import KRadar, read_labels, write
 from radejax.data.kradar.labels import Label
-from radejax.simulation.config import SimulationConfig, default_config
+from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
 from radejax.simulation.simulator import LabelSource
 from radejax.simulation.world import replay
@@ -46,19 +46,19 @@ def labels_folder(tmp_path):
 
 
 def make_config(folder, **changes):
-    values = default_config() | {
+    fields = {
         "scenes": str(folder),
         "frames_per_sequence": 0,
         "image_width": 0,
         "output": "projection",
         "grid": GRID,
     }
-    return values | changes
+    return SimulationOptions(**fields | changes)
 
 
 @pytest.fixture
 def source(labels_folder):
-    return LabelSource(SimulationConfig.from_mapping(make_config(labels_folder)))
+    return LabelSource(make_config(labels_folder))
 
 
 class TestScene:
@@ -144,7 +144,7 @@ class TestWrittenTree:
 
     def test_stride_and_number_of_frames(self, labels_folder):
         config = make_config(labels_folder, frame_stride=3, frames_per_sequence=4)
-        source = LabelSource(SimulationConfig.from_mapping(config))
+        source = LabelSource(config)
         assert [s.scene_idx for s in source.frames(3)] == [0, 3, 6, 9]
         assert source.frames(3)[1].indices == (34, 4, 8, 12, 14)
 
@@ -154,7 +154,7 @@ class TestWrittenTree:
         config = make_config(
             labels_folder, frame_stride=stride, frames_per_sequence=count
         )
-        source = LabelSource(SimulationConfig.from_mapping(config))
+        source = LabelSource(config)
         specs = source.frames(3)
         assert len(specs) == min(count, NUM_FRAMES // stride)
         assert {s.split for s in specs} == {"train", *["test"] * (count > 1)}
@@ -163,7 +163,7 @@ class TestWrittenTree:
         if count > 4 // stride:  # more frames than in the first quarter
             assert chosen[0] == 0
         whole = make_config(labels_folder, frame_stride=stride)
-        all_specs = LabelSource(SimulationConfig.from_mapping(whole)).frames(3)
+        all_specs = LabelSource(whole).frames(3)
         assert specs == [s for s in all_specs if s.scene_idx in chosen]
 
     def test_missing_labels(self, tmp_path):
@@ -175,13 +175,13 @@ class TestWrittenTree:
     def test_unknown_sequence(self, labels_folder):
         config = make_config(labels_folder, sequences=[4])
         with pytest.raises(UserError, match="sequence"):
-            LabelSource(SimulationConfig.from_mapping(config))
+            LabelSource(config)
 
 
 @pytest.mark.slow
 def test_all_of_kradar_makes_scenes(shared):
     values = make_config(shared / "data" / "kradar" / "labels_v2_1.zip")
-    source = LabelSource(SimulationConfig.from_mapping(values))
+    source = LabelSource(values)
     assert len(source.numbers) == 58
     for number in source.numbers:
         scene = source.make(number)

@@ -1,0 +1,223 @@
+"""The base class of all options, and the objects that options name."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Self
+
+import pydantic
+from annotated_types import Ge, Gt, Le, Lt
+
+from radejax.core.errors import UserError, require
+
+Size = Annotated[int, Ge(1), Le(1 << 16)]
+"""A number of channels, classes, heads or similar."""
+
+Count = Annotated[int, Ge(0)]
+AtLeastOne = Annotated[int, Ge(1)]
+Positive = Annotated[float, Gt(0)]
+NotNegative = Annotated[float, Ge(0)]
+Fraction = Annotated[float, Ge(0), Le(1)]
+BelowOne = Annotated[float, Ge(0), Lt(1)]
+Seed = Annotated[int, Ge(0), Lt(1 << 32)]
+
+_WORDS = (
+    ("greater than or equal to", "at least"),
+    ("less than or equal to", "at most"),
+    ("greater than", "above"),
+    ("less than", "below"),
+    ("a valid ", "a "),
+    ("Tuple should have ", ""),
+    ("a integer", "an integer"),
+)
+
+
+class Options(pydantic.BaseModel):
+    """Immutable options of one part of the program, which are a section of the config.
+
+    Types and ranges are those of the annotations; nothing is converted, except lists to tuples
+    and integers to floats. A subclass names its section, for example
+    `class TrainOptions(Options, section="config.train")`, which begins every message.
+
+    Raises:
+        UserError: A field is unknown, missing, of another type or out of its range.
+    """
+
+    model_config = pydantic.ConfigDict(
+        frozen=True,
+        extra="forbid",
+        strict=True,
+        allow_inf_nan=False,
+        protected_namespaces=(),
+    )
+    section: ClassVar[str] = "config"
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, section: str = "", **_: Any) -> None:
+        if section:
+            cls.section = section
+
+    def __init_subclass__(cls, section: str = "", **options: Any) -> None:
+        super().__init_subclass__(**options)
+
+    def __init__(self, **values: Any) -> None:
+        values = {name: as_tuples(value) for name, value in values.items()}
+        try:
+            super().__init__(**values)
+        except pydantic.ValidationError as error:
+            raise _explained(error, type(self), values) from None
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise UserError(
+            f"{self.section}.{name} cannot be set, because options are immutable: use "
+            f"config.replace or config.with_fields, which return new ones"
+        )
+
+    def replace(self, **changes: Any) -> Self:
+        """Returns validated options with other values.
+
+        Args:
+            **changes: Fields to replace. A mapping changes the named fields of a section and
+                keeps its others; an instance of `Options` replaces the section.
+
+        Examples:
+            config.replace(seed=1, train={"batch_size": 4})
+        """
+        return type(self)(**_merged(self, changes))
+
+    def with_fields(self, fields: Mapping[str, Any]) -> Self:
+        """Returns validated options with other values by dotted names.
+
+        Examples:
+            config.with_fields({"train.batch_size": 4, "loss.weights.focal": 8.0})
+        """
+        changes: dict[str, Any] = {}
+        for name, value in fields.items():
+            *sections, last = name.split(".")
+            place = changes
+            for section in sections:
+                place = place.setdefault(section, {})
+            place[last] = value
+        return self.replace(**changes)
+
+    def fields(self) -> Iterator[tuple[str, Any]]:
+        """Yields dotted name and value of every field of all sections."""
+        for name, value in self:
+            if isinstance(value, Options):
+                yield from ((f"{name}.{inner}", x) for inner, x in value.fields())
+            elif isinstance(value, dict):
+                yield from ((f"{name}.{inner}", x) for inner, x in value.items())
+            else:
+                yield name, value
+
+    def to_dict(self) -> dict[str, Any]:
+        """Returns the values as nested dictionaries."""
+        return self.model_dump()
+
+
+def _merged(current: Any, change: Any) -> Any:
+    """Returns a changed value; a mapping changes a section and is merged with its fields."""
+    if not isinstance(change, Mapping) or not isinstance(current, Options | Mapping):
+        return change
+    values = dict(current)
+    return values | {n: _merged(values.get(n), x) for n, x in change.items()}
+
+
+def as_tuples(value: Any) -> Any:
+    """Converts lists to tuples, recursively in lists and mappings."""
+    if isinstance(value, list | tuple):
+        return tuple(map(as_tuples, value))
+    if isinstance(value, Mapping):
+        return {name: as_tuples(inner) for name, inner in value.items()}
+    return value
+
+
+def _explained(
+    error: pydantic.ValidationError, cls: type[Options], values: Mapping[str, Any]
+) -> UserError:
+    """Returns the first error with the full name of its field."""
+    errors = error.errors(include_url=False)
+    first, place = errors[0], _place(errors[0]["loc"], values)
+    if isinstance(cause := first.get("ctx", {}).get("error"), UserError):
+        return cause  # a section's own message
+    name = f"{cls.section}{place}"
+    if first["type"] == "extra_forbidden":
+        hint = did_you_mean(str(first["loc"][-1]), cls.model_fields, f"{cls.section}.")
+        return UserError(f"{name} is not a field{hint}")
+    if first["type"] == "missing":
+        return UserError(f"{name} is missing")
+    # There is one error for each member of a union.
+    same = (one for one in errors if _place(one["loc"], values) == place)
+    expected = " or ".join(dict.fromkeys(map(_expected, same)))
+    return UserError(f"{name} is {first['input']!r}, expected {expected}")
+
+
+def _place(steps: Sequence[str | int], values: Any) -> str:
+    """Returns the names and indices of a wrong value, without the members of unions."""
+    place = ""
+    for step in steps:
+        try:
+            values = values[step]
+        except (KeyError, IndexError, TypeError):
+            if place:
+                continue
+        place += f"[{step}]" if isinstance(step, int) else f".{step}"
+    return place
+
+
+def _expected(error: Any) -> str:
+    """Returns pydantic's description of the values that are allowed, in our words."""
+    text = error["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+    text = text.partition(" after validation")[0]
+    for foreign, own in _WORDS:
+        text = text.replace(foreign, own)
+    limits = error.get("ctx", {})
+    for limit in limits.keys() & {"ge", "gt", "le", "lt"}:
+        kind = "an integer" if isinstance(limits[limit], int) else "a number"
+        text = f"{kind} {'of ' * text.startswith('at ')}{text}"
+    return text
+
+
+def find_part(
+    name: str, field: str, known: Mapping[str, Any], kind: type = object
+) -> Any:
+    """Returns the class, function or object that a field of a config names.
+
+    Args:
+        name: Name of a known part, or "module:Object" for another one, which is imported.
+            Commands find modules in the current folder too.
+        field: Name of the field for the error message.
+        known: Parts by name.
+        kind: Class from which the part is derived, or of which it is an instance.
+
+    Raises:
+        UserError: There is no such part, or it is of another kind.
+    """
+    part, (module, _, attribute) = known.get(str(name)), str(name).partition(":")
+    if part is None:
+        expected = " or ".join([*map(repr, known), "module:Object"])
+        is_name = isinstance(name, str) and bool(module and attribute)
+        require(is_name, field, name, expected)
+        try:
+            part = getattr(importlib.import_module(module), attribute)
+        except (ImportError, AttributeError) as error:
+            raise UserError(
+                f"{field} is {name!r}: {error}; run this in the folder of {module}, or add "
+                "that folder to PYTHONPATH"
+            ) from None
+    is_kind = kind in getattr(part, "__mro__", type(part).__mro__)
+    require(is_kind, field, name, f"the name of a {kind.__name__}")
+    return part
+
+
+def did_you_mean(name: str, known: Collection[str], prefix: str = "") -> str:
+    """Returns a hint at the known name that is most similar to a wrong one, or "".
+
+    Examples:
+        >>> did_you_mean("radnet", ["radenet", "dinorade"])
+        '; did you mean radenet?'
+    """
+    near = difflib.get_close_matches(name, known, 1)
+    return f"; did you mean {prefix}{near[0]}?" if near else ""

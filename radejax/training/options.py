@@ -1,0 +1,93 @@
+"""Options of the training and its logs: the sections `config.train` and `config.logging`."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import pydantic
+
+from radejax.core.errors import require
+from radejax.core.options import (
+    AtLeastOne,
+    BelowOne,
+    Count,
+    NotNegative,
+    Options,
+    Positive,
+)
+
+
+class TrainOptions(Options, section="config.train"):
+    """Batches, learning rate, checkpoints and evaluations of a training."""
+
+    batch_size: AtLeastOne = 10
+    """Frames per step over all devices."""
+    num_epochs: AtLeastOne = 10
+    """Passes over the training data."""
+    max_steps: AtLeastOne | None = None
+    """Steps after which the training ends if its epochs are longer; the learning rate
+    decreases over the steps that are taken. None: all epochs."""
+    learning_rate: Positive = 1e-3
+    """Peak learning rate of AdamW."""
+    final_learning_rate: NotNegative = 1e-4
+    """Final learning rate, at most the peak."""
+    schedule: Literal["cosine", "cyclic_cosine"] = "cosine"
+    """Learning rate per step: cosine (decreases once, over the training) or
+    cyclic_cosine (decreases in one epoch and increases in the next, as released)."""
+    weight_decay: NotNegative = 0.01
+    """Weight decay on every parameter."""
+    warmup_steps: Count = 0
+    """Steps of a linear warm-up from 0; fewer than the steps of the training."""
+    gradient_clip_norm: Positive | None = None
+    """Global norm to which the gradient is clipped; None: not clipped."""
+    ema_decay: BelowOne | None = None
+    """Decay per step of the exponential moving average of the parameters; None: no
+    average."""
+    gradient_accumulation_steps: AtLeastOne = 1
+    """Batches per update of the parameters."""
+    parameter_sharding: Literal["replicated", "fsdp"] = "replicated"
+    """replicated, or fsdp to shard the parameters over the devices."""
+    log_every_steps: AtLeastOne = 20
+    """Steps between logged metrics."""
+    checkpoint_every_steps: AtLeastOne = 500
+    """Steps between checkpoints."""
+    checkpoints_to_keep: AtLeastOne | None = 2
+    """Number of newest checkpoints that are kept; None: all."""
+    evaluate_every_epochs: Count = 0
+    """Epochs between evaluations; 0: only after the training."""
+    best_metric: str = "map_3d_iou30"
+    """Metric that selects the best checkpoint: a mean over classes in the first
+    protocol."""
+    max_skipped_steps: Count = 20
+    """The run stops after more than this number of consecutive steps whose loss or
+    gradient is not finite."""
+
+    @pydantic.model_validator(mode="after")
+    def _check(self) -> TrainOptions:
+        final, peak = self.final_learning_rate, self.learning_rate
+        expected = f"at most config.train.learning_rate, {peak}"
+        require(final <= peak, "config.train.final_learning_rate", final, expected)
+        return self
+
+
+class LoggingOptions(Options, section="config.logging"):
+    """Logs of a training beside `metrics.jsonl` and TensorBoard."""
+
+    num_visualizations: Count = 4
+    """Number of figures of fixed frames at every evaluation during training."""
+    wandb: bool = False
+    """Log to Weights & Biases in addition to TensorBoard."""
+    wandb_project: str = "radejax"
+    """Project at Weights & Biases."""
+    profile_steps: tuple[Count, Count] = (2, 5)
+    """First and last step of a profiler trace (`--profile`), counted from the step at
+    which the command starts or continues."""
+
+    @pydantic.model_validator(mode="after")
+    def _check(self) -> LoggingOptions:
+        first, last = self.profile_steps
+        expected = "two integers, the first not above the last"
+        require(
+            first <= last, "config.logging.profile_steps", self.profile_steps, expected
+        )
+        return self

@@ -1,0 +1,123 @@
+"""Options: changes of them, messages of wrong values, and the parts that they name."""
+
+import pathlib
+from typing import Any, Literal
+
+import pytest
+
+from radejax.core.errors import UserError
+from radejax.core.options import (
+    AtLeastOne,
+    BelowOne,
+    Fraction,
+    Options,
+    Positive,
+    Seed,
+    as_tuples,
+    find_part,
+)
+
+
+class Part(Options, section="config.part"):
+    rate: Fraction = 0.5
+    sizes: tuple[AtLeastOne, ...] = (1, 2)
+    scale: Positive | None = None
+    kind: Literal["a", "b"] = "a"
+    region: Literal["wide"] | tuple[float, ...] | None = None
+    mixed: tuple[int | float, ...] = ()
+    is_on: bool = False
+
+
+class Whole(Options):
+    count: int
+    seed: Seed = 0
+    decay: BelowOne = 0.0
+    weights: dict[str, Positive] = {"x": 1.0, "y": 2.0}  # noqa: RUF012, immutable
+    part: Part = Part()
+    other: Part | None = None
+
+
+WHOLE = Whole(count=1)
+
+
+def test_changes_are_of_fields_of_sections_or_of_whole_sections() -> None:
+    changed = WHOLE.replace(count=2, part={"rate": 1, "sizes": [3]})
+    assert changed.part == Part(rate=1.0, sizes=(3,))
+    assert isinstance(changed.part.rate, float)
+    assert (WHOLE.count, WHOLE.part) == (1, Part())
+    assert changed.replace(part=Part(kind="b")).part == Part(kind="b")
+    assert WHOLE.replace(other={"kind": "b"}).other == Part(kind="b")
+    assert WHOLE.replace(weights={"y": 3.0}).weights == {"x": 1.0, "y": 3.0}
+    names = {"count": 2, "part.rate": 1.0, "part.sizes": [3], "weights.z": 1.0}
+    by_name = WHOLE.with_fields(names)
+    assert by_name == changed.replace(weights={"z": 1.0})
+    assert dict(by_name.fields()) == {
+        **{"count": 2, "seed": 0, "decay": 0.0},
+        **{"weights.x": 1.0, "weights.y": 2.0, "weights.z": 1.0},
+        **{"part.rate": 1.0, "part.sizes": (3,), "part.scale": None},
+        **{"part.kind": "a", "part.region": None, "part.mixed": ()},
+        **{"part.is_on": False, "other": None},
+    }
+    assert Whole(**by_name.to_dict()) == by_name
+    assert as_tuples({"a": [1, [2]]}) == {"a": (1, (2,))}
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"count": 1.5}, "count is 1.5, expected a"),
+        ({"count": True}, "count is True, expected an integer"),
+        ({"count": "1"}, "count is '1', expected an integer"),
+        ({"seed": -1}, "seed is -1, expected an integer of at least 0"),
+        ({"seed": 2**32}, f"seed is {2**32}, expected an integer below {2**32}"),
+        ({"decay": 1.0}, "decay is 1.0, expected a number below 1"),
+        ({"decay": float("nan")}, "decay is nan, expected a"),
+        ({"weights.x": 0.0}, "weights.x is 0.0, expected a number above 0"),
+        ({"weights": 1}, "weights is 1, expected a dictionary"),
+        ({"part": 1}, "part is 1, expected "),
+        ({"other": {"rate": 2}}, "part.rate is 2, expected a number of at most 1"),
+        ({"part.rate": 2}, "part.rate is 2, expected a number of at most 1"),
+        ({"part.sizes": 3}, "part.sizes is 3, expected a tuple"),
+        ({"part.sizes": [1, 0]}, "part.sizes[1] is 0, expected an integer of at least"),
+        ({"part.scale": 0}, "part.scale is 0, expected a number above 0"),
+        ({"part.kind": "c"}, "part.kind is 'c', expected 'a' or 'b'"),
+        ({"part.region": 5}, "part.region is 5, expected 'wide'"),
+        ({"part.region": ("x",)}, "part.region"),
+        ({"part.mixed": ("x",)}, "part.mixed[0] is 'x', expected an integer"),
+        ({"part.is_on": 1}, "part.is_on is 1, expected a boolean"),
+        ({"part.rat": 1}, "part.rat is not a field; did you mean config.part.rate?"),
+        ({"seeed": 1}, "seeed is not a field; did you mean config.seed?"),
+    ],
+)
+def test_wrong_values_are_named(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(UserError) as refused:
+        WHOLE.with_fields(fields)
+    assert str(refused.value).startswith(f"config.{message}")
+    assert "\n" not in str(refused.value)
+
+
+def test_missing_fields_and_assignments_are_named() -> None:
+    with pytest.raises(UserError, match=r"^config\.count is missing$"):
+        Whole()
+    with pytest.raises(
+        UserError, match=r"^config\.part\.rate cannot be set, .*replace"
+    ):
+        WHOLE.part.rate = 1.0
+
+
+def test_parts_are_known_or_imported_and_of_one_kind() -> None:
+    known = {"floats": float}
+    assert find_part("floats", "config.x", known, float) is float
+    found = find_part("pathlib:Path", "config.x", known, pathlib.PurePath)
+    assert found is pathlib.Path
+    assert find_part("math:pi", "config.x", {}, float) > 3
+    for name, message in (
+        ("floats:", r"is 'floats:', expected 'floats' or module:Object"),
+        (":Path", r"is ':Path', expected 'floats' or module:Object"),
+        (None, r"is None, expected 'floats' or module:Object"),
+        ("pathlib:Paths", "no attribute 'Paths'; run this in the folder of pathlib"),
+        ("no.such:Thing", "No module named 'no'"),
+        ("pathlib:Path", "is 'pathlib:Path', expected the name of a float"),
+    ):
+        with pytest.raises(UserError, match=rf"^config\.x .*{message}"):
+            find_part(name, "config.x", known, float)
