@@ -22,10 +22,10 @@ import start
 from case import Case, compiled, difference, first_call, timed, waiting
 
 from radejax.config import load_config
+from radejax.data.kradar.tesseract import project_file
 from radejax.data.kradar.write import write_tesseract
 from radejax.data.pipeline import LoaderOptions, make_loader, make_table
 from radejax.data.projection import project_jax, project_tensor
-from radejax.data.tesseract import project_file
 from radejax.evaluation import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOLS
 from radejax.evaluation.results import ReportOptions, compute_results

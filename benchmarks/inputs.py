@@ -17,9 +17,8 @@ from PIL import Image
 
 from radejax.core.structures import CLASSES, Batch, DetectionMaps
 from radejax.core.workers import usable_cpus
-from radejax.data.cameras import CameraOptions
+from radejax.data.cameras import CameraInputs, CameraOptions
 from radejax.data.kradar.conditions import WEATHERS
-from radejax.data.pipeline import CameraInputs
 from radejax.data.projection import encode
 from radejax.data.records import Records
 from radejax.detection.decode import decode

@@ -119,7 +119,7 @@ RELEASES = {
     }
     for name, center in (("polar3d", 0.52), ("rpc", 0.5))
 }
-"""Fields for K-Radar's reduced releases, see `radejax.data.reduced`."""
+"""Fields for K-Radar's reduced releases, see `radejax.data.kradar.reduced`."""
 
 
 def get_config(arg: str | None = None) -> Config:

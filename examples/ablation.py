@@ -55,7 +55,7 @@ from radejax.config import Config, load_config
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
-from radejax.data.kradar.dataset import read_split
+from radejax.data.kradar.folders import read_split
 from radejax.data.kradar.reduce import reduce_dataset
 from radejax.data.kradar.write import write_splits
 from radejax.evaluation.comparison import difference

@@ -21,7 +21,7 @@ from tabulate import tabulate
 from radejax.cli import entry
 from radejax.core import files
 from radejax.core.errors import UserError
-from radejax.data.kradar.dataset import SIMULATION_MARKER as MARKER
+from radejax.data.kradar.folders import SIMULATION_MARKER as MARKER
 from radejax.evaluation.boxes import frame_keys
 from radejax.evaluation.comparison import compare
 from radejax.evaluation.evaluation_set import EvaluationSet

@@ -63,8 +63,9 @@ class OwnFrame(LabelledFrame):
 class OwnRadar(LabelledFrames):
     """The frames of a folder; every fifth drive is in the test split."""
 
-    def __init__(self, roots, labels=None, **not_used):
-        root, frames = pathlib.Path(roots[0]), []
+    @classmethod
+    def from_options(cls, options, classes):
+        root, frames = pathlib.Path(options.roots[0]), []
         labels_file = root / "boxes.csv"
         boxes_of = read_boxes(labels_file) if labels_file.exists() else {}
         for path in sorted((root / "radar").glob("*.npy")):
@@ -79,10 +80,10 @@ class OwnRadar(LabelledFrames):
                     classes=names,
                 )
             )
-        super().__init__(frames, GRID)
-        counts = self.summary().counts
-        counts["frames"] = len(frames)
-        counts["frames of boxes.csv without a radar file"] = len(boxes_of)
+        data = cls(frames, GRID)
+        data.counts["frames"] = len(frames)
+        data.counts["frames of boxes.csv without a radar file"] = len(boxes_of)
+        return data
 
     def of_split(self, split):
         require(split in ("train", "test"), "split", split, "train or test")
@@ -189,11 +190,11 @@ def main(root, workdir, drives, epochs):
     with entry.exit_codes():
         if not (root / "boxes.csv").exists():
             simulate(root, drives)
-        frames = OwnRadar([root], classes=CLASSES)
+        config = get_config().replace(data={"roots": (str(root),)})
+        frames = OwnRadar.from_options(config.data, CLASSES)
         frame = max(frames, key=lambda frame: len(frame.boxes))
         scene = radejax.frame_scene(frame, frame.read_projection(GRID), GRID)
         save_figure(radejax.draw_frame(scene), root / "frame.png")
-        config = get_config().replace(data={"roots": (str(root),)})
         if epochs is not None:
             config = config.replace(train={"num_epochs": epochs})
         radejax.run(config, workdir)

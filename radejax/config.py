@@ -24,7 +24,7 @@ from radejax.core.errors import UserError, require
 from radejax.core.files import as_path
 from radejax.core.options import Options, Seed, as_tuples, did_you_mean
 from radejax.core.structures import CLASSES
-from radejax.data.kradar.labels import LABEL_CLASSES
+from radejax.data.dataset import find_reader
 from radejax.data.options import DATA_PATHS, DataOptions
 from radejax.detection.decode import DecodeOptions
 from radejax.evaluation.evaluation_set import SPACES
@@ -81,10 +81,9 @@ class Config(Options):
 
     @pydantic.model_validator(mode="after")
     def _check(self) -> Config:
-        is_known = self.data.format != "kradar" or set(self.classes) <= {*LABEL_CLASSES}
+        find_reader(self.data.format).check_options(self.data, self.classes)
         is_different = len(set(self.classes)) == len(self.classes)
-        expected = f"different classes of {', '.join(LABEL_CLASSES)}"
-        require(is_known and is_different, "config.classes", self.classes, expected)
+        require(is_different, "config.classes", self.classes, "different classes")
         name, count = "config.model.num_classes", self.model.num_classes
         classes = f"{len(self.classes)}, the number of config.classes"
         require(count == len(self.classes), name, count, classes)

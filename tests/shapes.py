@@ -24,7 +24,7 @@ PACKAGES = (
     "data.kradar.write",
     "data.pipeline",
     "data.projection",
-    "data.tesseract",
+    "data.kradar.tesseract",
     "training.distributed",
     "training.step",
     "simulation",

@@ -17,11 +17,11 @@ from PIL import Image
 from radejax import models
 from radejax.config import Config
 from radejax.core.errors import UserError
-from radejax.data.cameras import CameraOptions
-from radejax.data.dataset import data_set
+from radejax.data.cameras import CameraOptions, camera_inputs
+from radejax.data.dataset import LabelledFrames, find_reader
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.check import check_dataset
-from radejax.data.pipeline import camera_inputs
+from radejax.data.options import DataOptions
 from radejax.data.projection import project_tensor
 from radejax.data.records import preprocess
 from radejax.evaluation.evaluation_set import EvaluationSet
@@ -108,6 +108,11 @@ def _write_toy(root: pathlib.Path) -> pathlib.Path:
     return root
 
 
+def _read_toy(root: pathlib.Path) -> LabelledFrames:
+    options = DataOptions(format="toy:Toy", roots=(str(root),))
+    return find_reader(options.format).from_options(options, ("Sedan",))
+
+
 def test_the_page_has_every_kind_of_part() -> None:
     assert len(BLOCKS) == 6
 
@@ -155,7 +160,7 @@ def test_the_page_shows_the_example_line_by_line() -> None:
 
 
 def test_the_toy_data_set_gives_what_a_run_asks(tmp_path: pathlib.Path) -> None:
-    frames = data_set("toy:Toy")([_write_toy(tmp_path)], classes=("Sedan",))
+    frames = _read_toy(_write_toy(tmp_path))
     train = frames.of_split("train")
     assert [frame.key for frame in train] == ["1/0001", "1/0002"]
     assert len(frames.without({"1/0001"}, "test")) == 3
@@ -171,13 +176,13 @@ def test_records_of_other_files_or_of_another_reader_are_reported(
     caplog: pytest.LogCaptureFixture,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    root, reader = _write_toy(tmp_path), data_set("toy:Toy")
+    root, reader = _write_toy(tmp_path), find_reader("toy:Toy")
     toy = sys.modules["toy"]
 
     def again() -> str:
         caplog.clear()
         with caplog.at_level("INFO", "radejax"):
-            preprocess(reader([root], classes=("Sedan",)), tmp_path / "records")
+            preprocess(_read_toy(root), tmp_path / "records")
         return caplog.text
 
     again()
@@ -353,9 +358,9 @@ def test_own_parts_are_imported_wherever_a_run_is_opened(
 
 
 def test_a_format_may_name_a_class_of_a_module() -> None:
-    assert data_set("radejax.data.kradar:KRadar") is KRadar
-    assert data_set("kradar") is KRadar
+    assert find_reader("radejax.data.kradar:KRadar") is KRadar
+    assert find_reader("kradar") is KRadar
     with pytest.raises(UserError, match=r"'json:Reader': .* no attribute 'Reader'"):
-        data_set("json:Reader")
+        find_reader("json:Reader")
     with pytest.raises(UserError, match=r"No module named 'no_module'"):
-        data_set("no_module:Reader")
+        find_reader("no_module:Reader")

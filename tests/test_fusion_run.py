@@ -16,7 +16,7 @@ from click.testing import CliRunner
 from radejax.cli.main import main
 from radejax.config import load_config, load_module
 from radejax.core.errors import DataError, UserError
-from radejax.data.pipeline import require_images
+from radejax.data.cameras import require_images
 from radejax.data.records import open_embeddings
 from radejax.inference.detect_files import detect_files, key_of
 from radejax.inference.detector import Detector

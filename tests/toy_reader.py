@@ -27,8 +27,9 @@ class ToyFrame(LabelledFrame):
 class Toy(LabelledFrames):
     """Drives of `ROOT/1`, `ROOT/2`, ...; the last one is the test split."""
 
-    def __init__(self, roots, labels=None, *, classes, **not_used):
-        root, frames = pathlib.Path(roots[0]), []
+    @classmethod
+    def from_options(cls, options, classes):
+        root, frames = pathlib.Path(options.roots[0]), []
         for path in sorted(root.glob("[0-9]*/*.npz")):
             content, image = np.load(path), path.with_suffix(".png")
             kept = np.isin(content["classes"], classes)
@@ -46,8 +47,9 @@ class Toy(LabelledFrames):
                     camera_calibration_path=root / "camera.json",
                 )
             )
-        super().__init__(frames, RadarGrid.from_dict(read_json(root / "grid.json")))
-        self.summary().counts["frames"] = len(frames)
+        data = cls(frames, RadarGrid.from_dict(read_json(root / "grid.json")))
+        data.counts["frames"] = len(frames)
+        return data
 
     def of_split(self, split):
         last = max(frame.sequence for frame in self)

@@ -250,8 +250,8 @@ def points(
     """
     import tqdm
 
-    from radejax.data.kradar.dataset import is_elevation_axis_up, read_grid
-    from radejax.data.points import read_points, write_points
+    from radejax.data.kradar.folders import is_elevation_axis_up, read_grid
+    from radejax.data.kradar.points import read_points, write_points
     from radejax.data.records import PreprocessReport
     from radejax.inference.detect_files import find_frames, sequence_folder
 

@@ -117,7 +117,7 @@ def _draw(frames: Any, frame: Any, slices: bool, lidar: bool, roi: str) -> Any:
             is there that is to be drawn.
     """
     from radejax.core.structures import ROIS
-    from radejax.data.points import read_lidar
+    from radejax.data.kradar.points import read_lidar
     from radejax.visualize.draw import draw_slices
 
     grid, fields = frames.grid, dict[str, Any](roi=ROIS.get(roi))
@@ -151,7 +151,7 @@ def view(
     """
     import tqdm
 
-    from radejax.data.reduced import check_release
+    from radejax.data.kradar.reduced import check_release
     from radejax.visualize.recordings import write_recording
 
     frames = radejax.KRadar(roots, visibility=None, **part)

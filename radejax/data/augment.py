@@ -7,16 +7,32 @@ every grid whose azimuth axis is symmetric.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
 
 import numpy as np
+from jaxtyping import Float, Int, Real
 
 from radejax.core.errors import UserError
 from radejax.geometry.camera import Camera
 from radejax.geometry.radar_grid import RadarGrid
 
-Sample = dict[str, Any]
-"""One sample: projection `[R, A, C]`, boxes `[N, 8]`, image and camera or None."""
+
+@dataclasses.dataclass(frozen=True)
+class Sample:
+    """One row of a batch before it is written into the batch.
+
+    Attributes:
+        projection: Projection of the frame and of those that precede it.
+        boxes: x, y, z, l, w, h, sin yaw, cos yaw, padded with zeros.
+        classes: Class indices, padded with -1.
+        image: Image or features; None for radar-only models.
+        camera: Camera; None for radar-only models.
+    """
+
+    projection: Real[np.ndarray, "R A C"]
+    boxes: Float[np.ndarray, "N 8"]
+    classes: Int[np.ndarray, " N"]
+    image: Real[np.ndarray, "_ _ _"] | None = None
+    camera: Camera | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,15 +69,15 @@ def mirror(sample: Sample) -> Sample:
 
     Radial velocity, elevation and range do not change. Padding boxes remain zero.
     """
-    camera, image, boxes = sample.get("camera"), sample.get("image"), sample["boxes"]
-    return {
-        **sample,
-        "projection": sample["projection"][:, ::-1],
-        # y and sin yaw change their sign.
-        "boxes": boxes * np.array([1, -1, 1, 1, 1, 1, -1, 1], boxes.dtype),
-        "image": None if image is None else image[:, ::-1],
-        "camera": None if camera is None else mirror_camera(camera),
-    }
+    # y and sin yaw change their sign.
+    signs = np.array([1, -1, 1, 1, 1, 1, -1, 1], sample.boxes.dtype)
+    return dataclasses.replace(
+        sample,
+        projection=sample.projection[:, ::-1],
+        boxes=sample.boxes * signs,
+        image=None if sample.image is None else sample.image[:, ::-1],
+        camera=None if sample.camera is None else mirror_camera(sample.camera),
+    )
 
 
 def mirror_camera(camera: Camera) -> Camera:

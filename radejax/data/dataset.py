@@ -1,7 +1,8 @@
-"""Interface of datasets: frames with their radar tensors, images and labels.
+"""Interface of datasets: frames with their radar data, images and labels.
 
-`radejax.data.kradar` reads K-Radar; docs/extending.md shows another reader. Readers are
-derived from `LabelledFrame` and `LabelledFrames`.
+A reader of a format is a class that is derived from `LabelledFrames`, with frames that are
+derived from `LabelledFrame`. `radejax.data.kradar` is the reader of K-Radar;
+docs/extending.md shows another one.
 """
 
 from __future__ import annotations
@@ -10,16 +11,15 @@ import collections
 import copy
 import dataclasses
 import pathlib
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, Self, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Shaped, UInt8
+from jaxtyping import Float, Shaped
 
 from radejax.core.errors import UserError
 from radejax.core.options import find_part
-from radejax.data.cameras import IMAGE_SIZE, read_left_image
-from radejax.data.tesseract import read_frame
+from radejax.data.options import DataOptions
 from radejax.geometry.camera import CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -42,6 +42,16 @@ class Summary:
     )
     problems: list[tuple[str, str]] = dataclasses.field(default_factory=list)
     notes: list[str] = dataclasses.field(default_factory=list)
+
+    def report(self, kind: str, message: str) -> None:
+        """Adds a problem."""
+        self.problems.append((kind, message))
+
+    def plus(self, other: Summary) -> Summary:
+        """Returns a summary of both."""
+        counts = self.counts.copy()
+        counts.update(other.counts)
+        return Summary(counts, self.problems + other.problems, self.notes + other.notes)
 
     def problem_counts(self) -> dict[str, int]:
         """Returns the number of problems of every kind."""
@@ -112,26 +122,22 @@ class LabelledFrame:
         return f"{self.sequence}/{self.name}"
 
     def read_projection(self, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
-        """Reads the float32 projection (see `tesseract.read_frame`).
+        """Reads the radar data and returns their float32 projection on the grid.
 
         Raises:
             FileNotFoundError: The frame has no radar file.
             DataError: The file is corrupted, or its shape does not match the grid.
         """
-        if self.radar_path is None:
-            raise FileNotFoundError("no radar tensor in any root")
-        return read_frame(self.radar_path, grid)
+        raise NotImplementedError
 
     def read_calibration(
         self, radar_from_lidar_m: tuple[float, ...] | None = None
     ) -> CameraCalibration:
-        """Reads the camera calibration, with the frame's own translation or a given one."""
-        path = self.camera_calibration_path
-        assert path is not None  # callers check it
-        shift_m = radar_from_lidar_m or self.radar_from_lidar_m
-        calibration = CameraCalibration.from_kradar(path, radar_from_lidar_m=shift_m)
-        calibration.require_view_ahead(path)
-        return calibration
+        """Reads the camera calibration, with the frame's own translation or a given one.
+
+        It is called only if there is a `camera_calibration_path`.
+        """
+        raise NotImplementedError
 
     def calibrated_size(self) -> tuple[int, int] | None:
         """Returns height and width of the calibration's images, or None without one."""
@@ -150,26 +156,64 @@ _F = TypeVar("_F", bound=LabelledFrame)
 class LabelledFrames(Sequence[_F]):
     """The frames of a dataset in a fixed order.
 
-    Readers of a format are subclasses that find and read the frames.
+    Readers of a format are subclasses with the methods `from_options` and `of_split`.
+
+    Args:
+        frames: The frames.
+        grid: Sensor axes of the radar.
+        summary: Summary of reading them.
+        is_simulated: Whether the dataset is simulated.
 
     Attributes:
-        grid: Sensor axes of the radar.
-        is_simulated: Whether the dataset is simulated.
+        grid, is_simulated: As given.
+        release: Reduced release from which the projections are computed (one of
+            `radejax.data.kradar.reduced.RELEASES`), or None.
         reader_version: Text that a reader changes when it computes other projections from
             the same files; records of another version are not used. None if neither the
             reader nor the files change, which are then not compared with their records.
-        release: Reduced release from which the projections are computed (one of
-            `radejax.data.reduced.RELEASES`), or None.
+        has_label_versions: Whether `config.data.label_version` applies to the format.
+        has_files_of_frames: Whether a detector reads the radar files by themselves. It then
+            finds them by the names of K-Radar's files, without their labels.
     """
 
-    reader_version: str | None = ""
     release: str | None = None
+    reader_version: str | None = ""
+    has_label_versions = False
+    has_files_of_frames = False
 
     def __init__(
-        self, frames: Sequence[_F], grid: RadarGrid, *, is_simulated: bool = False
+        self,
+        frames: Sequence[_F],
+        grid: RadarGrid,
+        summary: Summary | None = None,
+        *,
+        is_simulated: bool = False,
     ) -> None:
         self.grid, self.is_simulated = grid, is_simulated
-        self._frames, self._summary = frames, Summary()
+        self._frames, self._summary = frames, summary or Summary()
+
+    @classmethod
+    def from_options(cls, options: DataOptions, classes: Sequence[str]) -> Self:
+        """Reads all frames of a dataset.
+
+        Args:
+            options: The section `config.data`. Of the options that choose frames and
+                objects, those that the reader ignores are applied afterwards.
+            classes: Classes to detect. Objects of other classes may be left out.
+        """
+        raise NotImplementedError
+
+    @classmethod
+    def check_options(cls, options: DataOptions, classes: Sequence[str]) -> None:
+        """Raises `UserError` if the format has no such options or classes."""
+
+    def of_split(self, split: str | None) -> Self:
+        """Returns the frames of a split, such as "train" or "test".
+
+        Raises:
+            UserError: There is no such split.
+        """
+        raise NotImplementedError
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -181,13 +225,16 @@ class LabelledFrames(Sequence[_F]):
         """Returns a summary of what was read, skipped, missing and malformed."""
         return self._summary
 
-    def of_split(self, split: str | None) -> Self:
-        """Returns the frames of a split, such as "train" or "test".
+    @property
+    def counts(self) -> collections.Counter[str]:
+        """Numbers of items that were read and skipped, by reason (`summary().counts`)."""
+        return self._summary.counts
 
-        Raises:
-            UserError: There is no such split.
-        """
-        raise NotImplementedError
+    def _with(self, frames: Sequence[_F], summary: Summary) -> Self:
+        """Returns the dataset with other frames."""
+        other = copy.copy(self)
+        other._frames, other._summary = frames, summary
+        return other
 
     def without(self, left_out: Collection[str], reason: str) -> Self:
         """Returns the dataset without some frames.
@@ -196,12 +243,11 @@ class LabelledFrames(Sequence[_F]):
             left_out: Keys of the frames to leave out.
             reason: Reason under which they are counted in the summary.
         """
-        other = copy.copy(self)
-        other._summary = copy.deepcopy(self._summary)
-        other._frames = [frame for frame in self if frame.key not in left_out]
-        counts = other._summary.counts
-        counts[f"frames left out: {reason}"] += len(self) - len(other)
-        return other
+        frames = [frame for frame in self if frame.key not in left_out]
+        counts = {f"frames left out: {reason}": len(self) - len(frames)}
+        return self._with(
+            frames, self._summary.plus(Summary(collections.Counter(counts)))
+        )
 
     def part(
         self, sequences: Collection[int] | None, weather: Collection[str] | None
@@ -213,6 +259,8 @@ class LabelledFrames(Sequence[_F]):
             if (sequences and frame.sequence not in sequences)
             or (weather and frame.weather not in weather)
         }
+        if not left_out:
+            return self
         return self.without(left_out, "other sequences or weather")
 
     def with_valid_boxes(self, classes: Collection[str]) -> Self:
@@ -225,11 +273,9 @@ class LabelledFrames(Sequence[_F]):
         Raises:
             UserError: Yaws are in degrees.
         """
-        other = copy.copy(self)
-        other._summary = copy.deepcopy(self._summary)
-        counts = other._summary.counts
-        other._frames = [self._valid(frame, classes, counts) for frame in self]
-        return other
+        counts = collections.Counter[str]()
+        frames = [self._valid(frame, classes, counts) for frame in self]
+        return self._with(frames, self._summary.plus(Summary(counts)))
 
     def _valid(
         self, frame: _F, classes: Collection[str], counts: collections.Counter[str]
@@ -256,11 +302,8 @@ class LabelledFrames(Sequence[_F]):
         return dataclasses.replace(frame, boxes=boxes[kept], classes=names[kept])
 
 
-def data_set(name: str) -> Callable[..., LabelledFrames]:
+def find_reader(name: str) -> type[LabelledFrames]:
     """Returns the reader of a format.
-
-    It is called with the roots, the labels and the options of `KRadar`; another reader may
-    ignore options that do not apply to it.
 
     Args:
         name: "kradar", or "module:Class" for another reader.
@@ -272,21 +315,44 @@ def data_set(name: str) -> Callable[..., LabelledFrames]:
     return find_part(place, "config.data.format", {"kradar": None}, LabelledFrames)
 
 
-def front_view(
-    frame: LabelledFrame,
-) -> tuple[UInt8[np.ndarray, "H W 3"] | None, CameraCalibration | None]:
-    """Returns the left front image of a frame and its calibration for drawing.
+def held_out(
+    sequences: Collection[int], validation: Sequence[float], seed: int
+) -> list[int]:
+    """Returns the sequences of the train split that are held out for validation.
 
-    The image is resized to the image size of the calibration, or to `IMAGE_SIZE` without
-    one. Missing items are None, and both are None without an image.
+    Args:
+        sequences: Numbers of the sequences that have training frames.
+        validation: Numbers of the sequences to hold out; or a single fraction between 0
+            and 1 of the sequences, of which at least one is drawn at random; or () for
+            none.
+        seed: Seed of the random draw.
+
+    Returns:
+        The sorted numbers of the held-out sequences.
 
     Raises:
-        DataError: A file is corrupted.
+        UserError: A sequence has no training frames, or none is left to train on.
+
+    Examples:
+        >>> held_out({1, 2, 5}, (5,), 0)
+        [5]
+        >>> len(held_out(range(1, 59), (0.1,), 0))
+        6
     """
-    if frame.camera_path is None:
-        return None, None
-    camera = None
-    if frame.camera_calibration_path is not None:
-        camera = frame.read_calibration()
-    size = IMAGE_SIZE if camera is None else (camera.height, camera.width)
-    return read_left_image(frame.camera_path, size, resize=True), camera
+    here = sorted(set(sequences))
+    if len(validation) == 1 and 0 < validation[0] < 1:
+        count = max(1, round(validation[0] * len(here)))
+        chosen = {int(n) for n in np.random.default_rng(seed).permutation(here)[:count]}
+    else:
+        chosen = {int(number) for number in validation}
+    if absent := sorted(chosen.difference(here)):
+        raise UserError(
+            f"config.data.validation holds out sequences {absent}, which have no frames in "
+            f"the train split; there are {here}"
+        )
+    if chosen and len(chosen) == len(here):
+        raise UserError(
+            f"config.data.validation is {tuple(validation)}, which holds out every "
+            f"sequence of the train split ({here}); leave at least one"
+        )
+    return sorted(chosen)

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
+import numpy as np
 import pydantic
 from annotated_types import Ge, MinLen
 
 from radejax.core.errors import require
 from radejax.core.options import AtLeastOne, Count, Fraction, Options, Seed
-from radejax.data.cameras import CameraOptions
-from radejax.data.dataset import data_set
-from radejax.data.kradar.conditions import WEATHERS
-from radejax.data.kradar.labels import VERSIONS, VISIBILITY_FLAGS
+from radejax.geometry.camera import ImageKind
 from radejax.geometry.radar_grid import AzimuthMapping
 
 DATA_PATHS = (
@@ -21,8 +20,42 @@ DATA_PATHS = (
 )
 """Fields of `DataOptions` that differ from machine to machine."""
 
-_VERSIONS = (*VERSIONS, *(version.removeprefix("v") for version in VERSIONS))
 Path = Annotated[str, MinLen(1)]
+
+
+class CameraOptions(Options, section="config.data.camera"):
+    """Options of images and calibrations."""
+
+    projection: ImageKind = "raw"
+    """raw (with lens distortion) or pinhole (without, as released)."""
+    radar_from_lidar_m: tuple[float, float, float] | None = None
+    """Translation t of `p_radar = p_lidar + t` in meters for all frames; None: each
+    frame's own."""
+    radar_from_lidar_z_m: float | None = None
+    """z of t in the camera projection, which does not move boxes; None: K-Radar's 0.7, or
+    the simulation's. Unused with `radar_from_lidar_m`."""
+    calibration: Literal["sequence", "common"] = "sequence"
+    """sequence (each sequence's own) or common (cam_front0.yml, as released)."""
+    resize: bool = False
+    """Resize images, and their calibrations, of another size than `model.image.size`;
+    otherwise such an image is an error."""
+    allow_missing: bool = True
+    """Predict frames without an image or a calibration from the radar only; otherwise such a
+    frame is an error."""
+
+    def shift(
+        self, own_m: Sequence[float] | np.ndarray, own_z_m: float
+    ) -> tuple[float, ...]:
+        """Returns the translation t of `p_radar = p_lidar + t` for one frame.
+
+        Args:
+            own_m: The frame's own t.
+            own_z_m: z of the frame's t according to the mounting positions.
+        """
+        if self.radar_from_lidar_m is not None:
+            return tuple(map(float, self.radar_from_lidar_m))
+        z = self.radar_from_lidar_z_m
+        return tuple(map(float, (*own_m[:2], own_z_m if z is None else z)))
 
 
 class DataOptions(Options, section="config.data"):
@@ -79,17 +112,6 @@ class DataOptions(Options, section="config.data"):
 
     @pydantic.model_validator(mode="after")
     def _check(self) -> DataOptions:
-        data_set(self.format)
-        for name, known in (
-            ("label_version", _VERSIONS),
-            ("visibility", VISIBILITY_FLAGS),
-            ("weather", WEATHERS),
-        ):
-            value = getattr(self, name)
-            values = (value,) if isinstance(value, str) else value or ()
-            is_known = set(values) <= set(known) and len(set(values)) == len(values)
-            expected = f"different ones of {', '.join(known)}"
-            require(is_known, f"config.data.{name}", value, expected)
         is_different = len(set(self.sequences)) == len(self.sequences)
         expected = "different sequence numbers; () for all"
         require(is_different, "config.data.sequences", self.sequences, expected)

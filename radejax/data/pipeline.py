@@ -23,170 +23,15 @@ from jaxtyping import Float, Int, Real
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES, Batch
 from radejax.core.workers import usable_cpus
-from radejax.data.augment import Augmentation
-from radejax.data.cameras import CameraOptions, no_camera, read_left_image
-from radejax.data.dataset import FrameSequence, LabelledFrame
+from radejax.data.augment import Augmentation, Sample
+from radejax.data.cameras import CameraInputs, no_camera
+from radejax.data.dataset import FrameSequence
 from radejax.data.projection import stack_frames
 from radejax.data.records import Records
 from radejax.geometry.boxes import boxes8_from_7
 from radejax.geometry.camera import Camera, stack_cameras
 
 _log = logging.getLogger(__name__)
-
-# Images and cameras ------------------------------------------------------------------
-
-
-@dataclasses.dataclass(frozen=True)
-class CameraInputs:
-    """Camera inputs of a model: an image and a camera for every frame.
-
-    Attributes:
-        cameras: One camera per frame, NumPy float64. `is_valid` is False if the frame
-            has no image or no calibration.
-        image_size: Height and width of the images that the model receives.
-        options: Options that the cameras were created with.
-        features: Features from an image backbone that replace the images, or None.
-        sources: For every frame, the path of its front image or the key of its
-            features; None for frames without either.
-        calibrated_sizes: For every frame, height and width of the images of its
-            calibration; None for frames without one.
-    """
-
-    cameras: tuple[Camera, ...]
-    image_size: tuple[int, int]
-    options: CameraOptions
-    features: Records | None
-    sources: Sequence[Any]
-    calibrated_sizes: Sequence[tuple[int, int] | None]
-
-    def empty_images(self, count: int) -> Real[np.ndarray, "{count} _ _ _"]:
-        """Returns black images `[count, H, W, 3]` uint8, or features that are zero."""
-        if self.features is not None:
-            return np.zeros((count, *self.features.shape), self.features.dtype)
-        return np.zeros((count, *self.image_size, 3), np.uint8)
-
-    def image(self, index: int) -> Real[np.ndarray, "_ _ _"]:
-        """Returns the image or features of one frame; zeros if they are missing."""
-        source = self.sources[index]
-        if source is None:
-            return self.empty_images(1)[0]
-        if self.features is not None:
-            return self.features[source]
-        size = self.calibrated_sizes[index]
-        return read_left_image(
-            source, self.image_size, resize=self.options.resize, calibrated_size=size
-        )
-
-
-def camera_inputs(
-    frames: FrameSequence,
-    image_size: tuple[int, int],
-    options: CameraOptions,
-    features: Records | None = None,
-) -> CameraInputs:
-    """Returns the left front images and cameras of frames.
-
-    Every calibration file is read only once.
-
-    Args:
-        frames: Frames of a dataset.
-        image_size: Height and width of the images that the model receives.
-        options: Camera options. With `allow_missing`, frames without an image or a
-            calibration have a camera whose `is_valid` is False and, without an image, a
-            black image; their number is logged.
-        features: Output of `radejax embed` (see `open_embeddings`), or None. With
-            features, the image files are not read.
-
-    Raises:
-        UserError: A frame has no image or calibration and `allow_missing` is False; a
-            calibration is for another image size and `resize` is False; or an image is
-            not among the features.
-        DataError: A calibration file is corrupted.
-    """
-    sources: list[Any] = [frame.camera_path for frame in frames]
-    if features is not None:
-        keys = features.keys()
-        sources = [frame.key if frame.key in keys else None for frame in frames]
-        with_image = [frame.key for frame in frames if frame.camera_path is not None]
-        if absent := [key for key in with_image if key not in keys]:
-            raise UserError(
-                f"{features.folder}: {len(absent)} of {len(frames)} frames have an image "
-                f"that is not embedded, the first is {absent[0]}; embed all of the data: "
-                "`radejax embed`"
-            )
-    views: list[tuple[Camera, tuple[int, int] | None]] = []
-    missing: list[str] = []
-    known: dict[Any, tuple[Camera, tuple[int, int]]] = {}
-    for frame, image in zip(frames, sources, strict=True):
-        if image is None or frame.camera_calibration_path is None:
-            missing.append(frame.key)
-            views.append((no_camera(image_size), None))
-            continue
-        shift = options.shift(frame.radar_from_lidar_m, frame.radar_from_lidar_z_m)
-        source = frame.camera_calibration_path, shift
-        if source not in known:
-            known[source] = _camera(frame, shift, image_size, options)
-        views.append(known[source])
-    if missing:
-        count = f"{len(missing)} of {len(frames)} frames"
-        what = f"{count} have no front image or no camera calibration"
-        if not options.allow_missing:
-            raise UserError(
-                f"{what}, the first is {missing[0]}; "
-                "config.data.camera.allow_missing=True uses only the radar there"
-            )
-        _log.warning("%s: radar only", what)
-    cameras = tuple(camera for camera, _ in views)
-    sizes = [size for _, size in views]
-    return CameraInputs(cameras, image_size, options, features, sources, sizes)
-
-
-def _camera(
-    frame: LabelledFrame,
-    radar_from_lidar_m: tuple[float, ...],
-    image_size: tuple[int, int],
-    options: CameraOptions,
-) -> tuple[Camera, tuple[int, int]]:
-    """Returns the camera of one frame for images of the model's size.
-
-    Returns:
-        The camera, and the height and width of the images of the calibration file.
-    """
-    calibration = frame.read_calibration(radar_from_lidar_m)
-    height, width = image_size
-    size = calibration.height, calibration.width
-    if size != image_size:
-        if not options.resize:
-            raise UserError(
-                f"{frame.camera_calibration_path}: calibration of {calibration.width} x "
-                f"{calibration.height} images, the model sees {width} x {height} "
-                "(config.model.image.size); config.data.camera.resize=True resizes"
-            )
-        calibration = calibration.resized(width, height)
-    return calibration.camera(options.projection), size
-
-
-def require_images(
-    frames: FrameSequence, inputs: CameraInputs | None, name: str = "train split"
-) -> None:
-    """Raises a `UserError` if no frame has both an image and a calibration.
-
-    Args:
-        frames: Frames of a split.
-        inputs: Camera inputs of these frames, or None for models without a camera.
-        name: Name of the frames for the error message.
-    """
-    if inputs is None or any(camera.is_valid for camera in inputs.cameras):
-        return
-    images = sum(frame.camera_path is None for frame in frames)
-    calibrations = sum(frame.camera_calibration_path is None for frame in frames)
-    raise UserError(
-        f"no frame of the {name} ({len(frames)}) can use the camera: {images} have "
-        f"no front image (cam-front/cam-front_*.png), {calibrations} no camera calibration "
-        "(calib_seq_v2/seq_*/cam_1.yml or common/cam_front0.yml of K-Radar's repository: "
-        "--camera-calibration FOLDER)"
-    )
-
 
 # Consecutive frames ------------------------------------------------------------------
 
@@ -478,24 +323,25 @@ class _LoadBatch(grain.transforms.Map):
         sample = self._sample(index)
         if self._augment is not None:
             sample = self._augment(sample, np.random.default_rng(seed))
-        batch.projection[row] = sample["projection"]
-        batch.boxes[row] = sample["boxes"]
-        batch.classes[row] = self._table.classes[index]
-        batch.is_valid[row] = batch.classes[row] >= 0
+        batch.projection[row] = sample.projection
+        batch.boxes[row] = sample.boxes
+        batch.classes[row] = sample.classes
+        batch.is_valid[row] = sample.classes >= 0
         batch.frame[row] = index
         if batch.image is not None:
-            batch.image[row] = sample["image"]
-        return sample["camera"]
+            batch.image[row] = sample.image
+        return sample.camera
 
-    def _sample(self, index: int) -> dict[str, Any]:
-        """Returns one frame; image and camera are None for radar-only models."""
+    def _sample(self, index: int) -> Sample:
+        """Returns the sample of one frame."""
         table, images = self._table, self._table.images
-        return {
-            "projection": read_sample(table.records, table.keys[index]),
-            "boxes": table.boxes[index],
-            "image": None if images is None else images.image(index),
-            "camera": None if images is None else images.cameras[index],
-        }
+        projection = read_sample(table.records, table.keys[index])
+        sample = Sample(projection, table.boxes[index], table.classes[index])
+        if images is None:
+            return sample
+        return dataclasses.replace(
+            sample, image=images.image(index), camera=images.cameras[index]
+        )
 
     def _empty(self, size: int) -> Batch:
         """Returns a batch that contains only padding."""

@@ -20,12 +20,13 @@ from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.core.files import PathLike
 from radejax.core.structures import BOX_FIELDS, Detections, frame_key
-from radejax.data.dataset import FrameSequence, data_set
+from radejax.data.cameras import camera_inputs, require_images
+from radejax.data.dataset import FrameSequence, find_reader
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.conditions import check_weather, read_description
-from radejax.data.kradar.dataset import sequence_number
-from radejax.data.pipeline import camera_inputs, frame_histories, require_images
-from radejax.data.reduced import is_reduced_file
+from radejax.data.kradar.folders import sequence_number
+from radejax.data.kradar.reduced import is_reduced_file
+from radejax.data.pipeline import frame_histories
 from radejax.evaluation import kitti
 from radejax.geometry.camera import Camera
 from radejax.inference.detector import Detector
@@ -209,7 +210,8 @@ def detect_files(
     """
     detector = Detector.from_workdir(source, step, image_backbone=image_backbone)
     data = detector.saved.config.data
-    read = _files if data.format == "kradar" else _frames
+    reader = find_reader(data.format)
+    read = _files if reader.has_files_of_frames else _frames
     part = {"sequence_numbers": sequence_numbers, "weather": weather}
     own = labels or data.labels, camera_calibration or data.camera_calibration
     keys, radar, images = read(paths, part, detector, *own)
@@ -315,13 +317,15 @@ def _frames(
 ) -> Inputs:
     """Find the frames by the reader of the run's own format."""
     config = detector.saved.config
-    frames = data_set(config.data.format)(
-        list(map(str, roots)),
-        labels,
-        classes=config.classes,
-        camera_calibration=camera_calibration,
-        **part,
-    ).part(part["sequence_numbers"], part["weather"])
+    options = config.data.replace(
+        roots=tuple(map(str, roots)),
+        labels=None if labels is None else str(labels),
+        camera_calibration=camera_calibration and str(camera_calibration),
+    )
+    reader = find_reader(options.format)
+    frames = reader.from_options(options, config.classes).part(
+        part["sequence_numbers"], part["weather"]
+    )
     if not len(frames):
         named = ", ".join(map(str, roots))
         raise UserError(f"no frames in {named}: give the roots of the dataset")

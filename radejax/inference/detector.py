@@ -25,6 +25,14 @@ from radejax.core.errors import UserError, require
 from radejax.core.files import PathLike, as_path
 from radejax.core.structures import ROIS, Array, Batch, Detections, to_float
 from radejax.data.cameras import CameraOptions, no_camera, no_images, read_left_image
+from radejax.data.kradar.reduced import (
+    RELEASES,
+    check_release,
+    is_reduced,
+    project_reduced,
+    release_of_file,
+)
+from radejax.data.kradar.tesseract import read_frame
 from radejax.data.projection import (
     MAX_LEVEL,
     find_problem,
@@ -32,14 +40,6 @@ from radejax.data.projection import (
     stack_frames,
     to_log_scale,
 )
-from radejax.data.reduced import (
-    RELEASES,
-    check_release,
-    is_reduced,
-    project_reduced,
-    release_of_file,
-)
-from radejax.data.tesseract import read_frame
 from radejax.detection.decode import ROI_LIMITS, decode, is_roi
 from radejax.geometry.camera import (
     KRADAR_RADAR_FROM_LIDAR_Z_M,

@@ -14,9 +14,9 @@ from jaxtyping import Shaped, UInt8
 
 from radejax.core.errors import UserError
 from radejax.core.structures import Batch
-from radejax.data.cameras import read_left_image
+from radejax.data.cameras import CameraInputs, read_left_image
 from radejax.data.dataset import FrameSequence, LabelledFrame
-from radejax.data.pipeline import CameraInputs, LoaderOptions, make_loader, make_table
+from radejax.data.pipeline import LoaderOptions, make_loader, make_table
 from radejax.data.records import Records, embedding_fields
 from radejax.inference.detector import Detector
 from radejax.models.dinorade import IMAGE_BACKBONE, DinoRade

@@ -18,12 +18,16 @@ from radejax.config import Config, check_bins
 from radejax.core.errors import UserError, require
 from radejax.core.files import as_path
 from radejax.core.structures import Batch
-from radejax.data import pipeline, records, reduced
+from radejax.data import cameras, pipeline, records
 from radejax.data.augment import Augmentation
-from radejax.data.cameras import CameraOptions
-from radejax.data.dataset import FrameSequence, LabelledFrames, data_set
-from radejax.data.kradar.dataset import held_out
-from radejax.data.options import DATA_PATHS
+from radejax.data.dataset import (
+    FrameSequence,
+    LabelledFrames,
+    find_reader,
+    held_out,
+)
+from radejax.data.kradar.reduced import check_release
+from radejax.data.options import DATA_PATHS, CameraOptions
 from radejax.data.projection import decode
 from radejax.data.records import Records
 from radejax.inference.saved import SavedModel
@@ -82,25 +86,12 @@ class Data:
                     "config.data.mirror_probability=0"
                 )
             self.features = records.open_embeddings(options.embeddings, image.to_dict())
-        is_common = self.camera is not None and self.camera.calibration == "common"
-        self.frames = data_set(options.format)(
-            options.roots,
-            options.labels,
-            version=options.label_version,
-            visibility=options.visibility,
-            classes=config.classes,
-            camera_calibration=options.camera_calibration,
-            common_camera=is_common,
-            include_unstarred_v11_labels=options.include_unstarred_v11_labels,
-            sequence_numbers=options.sequences or None,
-            weather=options.weather or None,
-        )
+        frames = find_reader(options.format).from_options(options, self.classes)
+        self.frames = frames.with_valid_boxes(self.classes)
         name = f"radar data in {', '.join(options.roots)}"
-        reduced.check_release(self.frames.release, options.release, name)
+        check_release(self.frames.release, options.release, name)
         if self.frames.release is not None and not config.model.doppler_bins:
             self.frames.grid = self.frames.grid.without_doppler()
-        if options.format != "kradar":  # the reader of K-Radar checks its labels itself
-            self.frames = self.frames.with_valid_boxes(self.classes)
 
     def preprocess(self) -> None:
         """Write the missing records on the main process while the others wait.
@@ -156,9 +147,7 @@ class Data:
         return self._splits[name]
 
     def _chosen(self, frames: LabelledFrames) -> LabelledFrames:
-        """Return the frames of the chosen sequences and weathers; `KRadar` has only these."""
-        if self.options.format == "kradar":
-            return frames
+        """Return the frames of the chosen sequences and weathers."""
         return frames.part(self.options.sequences, self.options.weather)
 
     def _part_of_train(self, name: str) -> LabelledFrames:
@@ -190,7 +179,7 @@ class Data:
         """
         return "validation" if self.options.validation else "test"
 
-    def images(self, frames: FrameSequence) -> pipeline.CameraInputs | None:
+    def images(self, frames: FrameSequence) -> cameras.CameraInputs | None:
         """Return the images and cameras of frames, or None for a radar-only model.
 
         Raises:
@@ -199,7 +188,7 @@ class Data:
         if self.camera is None:
             return None
         size = self._model.options.image.size
-        return pipeline.camera_inputs(frames, size, self.camera, self.features)
+        return cameras.camera_inputs(frames, size, self.camera, self.features)
 
     def training_batches(
         self, frames: FrameSequence, train: TrainOptions, seed: int
@@ -216,7 +205,7 @@ class Data:
                 a usable image, or there are fewer frames than one batch needs.
         """
         images, options = self.images(frames), self.options
-        pipeline.require_images(frames, images)
+        cameras.require_images(frames, images)
         table = pipeline.make_table(
             self.records,
             frames,

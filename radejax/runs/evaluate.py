@@ -17,8 +17,8 @@ from radejax.config import Config
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.core.structures import Boxes
-from radejax.data.dataset import FrameSequence, LabelledFrame
-from radejax.data.pipeline import require_images
+from radejax.data.cameras import require_images
+from radejax.data.dataset import FrameSequence, LabelledFrame, find_reader
 from radejax.data.projection import decode
 from radejax.evaluation.boxes import Columns, roi_bounds, tables_from_frames, take
 from radejax.evaluation.evaluation_set import Result
@@ -258,7 +258,7 @@ def report_options(config: Config, **changes: Any) -> ReportOptions:
             f"classes has {unknown[0]!r}, expected some of the run's: "
             f"{', '.join(config.classes)}"
         )
-    has_versions = config.data.format == "kradar"
+    has_versions = find_reader(config.data.format).has_label_versions
     own = {
         "classes": config.classes,
         "label_version": config.data.label_version if has_versions else None,

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from radejax.core.structures import Boxes
-from radejax.data.dataset import FrameSequence, LabelledFrame, front_view
+from radejax.data.cameras import front_view
+from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.pipeline import read_sample, sample_keys
 from radejax.data.projection import decode
 from radejax.evaluation.results import condition_masks

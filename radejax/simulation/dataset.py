@@ -29,7 +29,7 @@ from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.core.workers import default_workers, process_pool
 from radejax.data.kradar import write as kradar_write
-from radejax.data.kradar.dataset import SIMULATION_MARKER
+from radejax.data.kradar.folders import SIMULATION_MARKER
 from radejax.data.kradar.labels import Label
 from radejax.geometry.camera import CameraCalibration
 from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibration

@@ -13,8 +13,8 @@ from jaxtyping import Float
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.core.files import PathLike
-from radejax.data.kradar.dataset import read_grid
-from radejax.data.tesseract import read_power
+from radejax.data.kradar.folders import read_grid
+from radejax.data.kradar.tesseract import read_power
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.radar.fit import fit_radar

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, UInt32
 
 from radejax.core.errors import UserError
 from radejax.data.kradar import Frame, KRadar
-from radejax.data.kradar.dataset import split_by_rule
+from radejax.data.kradar.folders import split_by_rule
 from radejax.data.kradar.labels import Label, LabelHeader
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.config import SimulationOptions

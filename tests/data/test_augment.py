@@ -9,6 +9,7 @@ from PIL import Image
 from radejax.core.errors import UserError
 from radejax.data.augment import (
     Augmentation,
+    Sample,
     mirror,
     mirror_camera,
 )
@@ -37,7 +38,8 @@ def sample(boxes, dtype=np.float16, seed=0):
     for x, y in boxes[:, :2]:
         r, a = GRID.nearest_bin(x, y)
         projection[r, a] = 0.9
-    return {"projection": encode(projection, np.dtype(dtype).name), "boxes": boxes}
+    classes = np.zeros(len(boxes), np.int32)
+    return Sample(encode(projection, np.dtype(dtype).name), boxes, classes)
 
 
 box = st.tuples(
@@ -56,19 +58,19 @@ boxes_st = st.lists(box, min_size=1, max_size=4).map(lambda b: np.array(b, np.fl
 def test_mirrored_boxes_and_maps_stay_in_register(boxes, seed):
     before = sample(boxes, seed=seed)
     after = mirror(before)
-    for old, new in zip(boxes, after["boxes"], strict=True):
+    for old, new in zip(boxes, after.boxes, strict=True):
         (r, a), (r2, a2) = GRID.nearest_bin(*old[:2]), GRID.nearest_bin(*new[:2])
         assert r == r2
         assert abs((GRID.num_azimuth - 1 - a) - a2) <= 1  # halves round to even
         np.testing.assert_array_equal(
-            after["projection"][r, GRID.num_azimuth - 1 - a], before["projection"][r, a]
+            after.projection[r, GRID.num_azimuth - 1 - a], before.projection[r, a]
         )
         # Heading (cos, sin) mirrors with the position.
         np.testing.assert_array_equal(new[[7, 6]], old[[7, 6]] * (1, -1))
         np.testing.assert_array_equal(new[[0, 2, 3, 4, 5]], old[[0, 2, 3, 4, 5]])
     twice = mirror(after)
-    np.testing.assert_array_equal(twice["projection"], before["projection"])
-    np.testing.assert_array_equal(twice["boxes"], boxes)
+    np.testing.assert_array_equal(twice.projection, before.projection)
+    np.testing.assert_array_equal(twice.boxes, boxes)
 
 
 @settings(deadline=None, max_examples=60)
@@ -93,12 +95,12 @@ def test_mirrored_camera_sees_the_mirrored_world_in_the_mirrored_image(points, k
 def test_image_is_mirrored_with_its_camera():
     image = np.arange(2 * 3 * 3, dtype=np.uint8).reshape(2, 3, 3)
     boxes = np.array([[10.0, 1, 0, 4, 2, 1, 0, 1]])
-    before = {**sample(boxes), "image": image, "camera": CAMERA.camera()}
+    before = dataclasses.replace(sample(boxes), image=image, camera=CAMERA.camera())
     after = mirror(before)
-    np.testing.assert_array_equal(after["image"], image[:, ::-1])
-    assert after["camera"].intrinsics[2] == 1280 - 600
-    assert before["camera"].intrinsics[2] == 600
-    assert mirror(sample(boxes))["image"] is None
+    np.testing.assert_array_equal(after.image, image[:, ::-1])
+    assert after.camera.intrinsics[2] == 1280 - 600
+    assert before.camera.intrinsics[2] == 600
+    assert mirror(sample(boxes)).image is None
 
 
 def test_a_point_has_its_color_in_the_resized_and_the_mirrored_image(tmp_path):
@@ -116,10 +118,12 @@ def test_a_point_has_its_color_in_the_resized_and_the_mirrored_image(tmp_path):
         width, height = 128 // scale, 64 // scale
         image = read_left_image(tmp_path / "a.png", (height, width), resize=True)
         camera = calibration.resized(width, height).camera()
-        before = {**sample(np.zeros((1, 8))), "image": image, "camera": camera}
+        before = dataclasses.replace(
+            sample(np.zeros((1, 8))), image=image, camera=camera
+        )
         for frame, sign in ((before, 1), (mirror(before), -1)):
-            (pixels, _) = project(points * (1, sign, 1), frame["camera"])
-            row = frame["image"][0, :, 0].astype(float)
+            (pixels, _) = project(points * (1, sign, 1), frame.camera)
+            row = frame.image[0, :, 0].astype(float)
             colors.append(np.interp(pixels[:, 0] - 0.5, np.arange(width), row))
     for found in colors[1:]:
         np.testing.assert_allclose(found, colors[0], atol=1e-6)
@@ -132,11 +136,11 @@ def test_augmentation_is_a_function_of_its_seed():
     for seed in range(40):
         one = augment(before, np.random.default_rng(seed))
         two = augment(before, np.random.default_rng(seed))
-        np.testing.assert_array_equal(one["projection"], two["projection"])
-        outcomes[one["boxes"][0, 1]] = outcomes.get(one["boxes"][0, 1], 0) + 1
+        np.testing.assert_array_equal(one.projection, two.projection)
+        outcomes[one.boxes[0, 1]] = outcomes.get(one.boxes[0, 1], 0) + 1
     assert set(outcomes) == {3.0, -3.0}
     assert 10 <= outcomes[3.0] <= 30
-    np.testing.assert_array_equal(before["boxes"][0, 1], 3.0)
+    np.testing.assert_array_equal(before.boxes[0, 1], 3.0)
 
 
 def test_off_is_off():
@@ -147,7 +151,8 @@ def test_off_is_off():
 
 def test_padding_stays_zero():
     padded = np.zeros((3, 8), np.float32)
-    boxes = mirror(sample(np.zeros((0, 8))) | {"boxes": padded})["boxes"]
+    before = dataclasses.replace(sample(np.zeros((0, 8))), boxes=padded)
+    boxes = mirror(before).boxes
     np.testing.assert_array_equal(boxes, padded)
     assert boxes.dtype == np.float32
 

@@ -7,9 +7,13 @@ import pytest
 from PIL import Image
 
 from radejax.core.errors import DataError, UserError
-from radejax.data.cameras import IMAGE_SIZE, CameraOptions, read_left_image
+from radejax.data.cameras import (
+    IMAGE_SIZE,
+    CameraOptions,
+    camera_inputs,
+    read_left_image,
+)
 from radejax.data.kradar import Frame
-from radejax.data.pipeline import camera_inputs
 from radejax.geometry.camera import CameraCalibration, project
 from radejax.simulation.camera.renderer import stereo_calibration
 

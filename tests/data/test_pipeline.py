@@ -12,14 +12,13 @@ import pytest
 from PIL import Image
 
 from radejax.core.errors import DataError, UserError
-from radejax.core.structures import Batch
+from radejax.core.structures import CLASSES, Batch
 from radejax.data import pipeline
 from radejax.data.augment import Augmentation
-from radejax.data.cameras import IMAGE_SIZE, CameraOptions
+from radejax.data.cameras import IMAGE_SIZE, CameraOptions, camera_inputs
 from radejax.data.kradar import KRadar
 from radejax.data.pipeline import (
     LoaderOptions,
-    camera_inputs,
     frame_histories,
     make_loader,
     make_table,
@@ -79,7 +78,7 @@ def test_batches_are_the_records_and_labels(loader, records, data):
             yaw = np.arctan2(found[:, 6], found[:, 7])
             wanted = np.arctan2(np.sin(frame.boxes[:, 6]), np.cos(frame.boxes[:, 6]))
             np.testing.assert_allclose(yaw, wanted, atol=1e-6)
-            assert [data.classes[i] for i in batch.classes[row, :count]] == list(
+            assert [CLASSES[i] for i in batch.classes[row, :count]] == list(
                 frame.classes
             )
             assert not batch.boxes[row, count:].any()

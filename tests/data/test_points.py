@@ -4,22 +4,21 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import DataError, UserError
-from radejax.data.kradar.write import write_tesseract
-from radejax.data.points import (
+from radejax.data.kradar.points import (
     POINT_FIELDS,
-    cfar_points,
-    local_mean_db,
     read_lidar,
     read_points,
     write_points,
 )
-from radejax.data.projection import project_tensor
-from radejax.data.reduced import (
+from radejax.data.kradar.reduced import (
     points_of_bins,
     project_reduced,
     reduce_tensor,
     strongest_points,
 )
+from radejax.data.kradar.write import write_tesseract
+from radejax.data.points import cfar_points, local_mean_db
+from radejax.data.projection import project_tensor
 from radejax.geometry.radar_grid import RadarGrid
 
 from .. import small_models as small

@@ -23,9 +23,9 @@ from radejax.core.workers import process_pool
 from radejax.data import records as records_module
 from radejax.data.dataset import LabelledFrames
 from radejax.data.kradar import KRadar
+from radejax.data.kradar.tesseract import project_file, read_tesseract
 from radejax.data.projection import project_tensor
 from radejax.data.records import Records, open_embeddings, open_projections, preprocess
-from radejax.data.tesseract import project_file, read_tesseract
 from radejax.geometry.radar_grid import RadarGrid
 
 from .. import small_models as small

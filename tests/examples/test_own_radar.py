@@ -12,6 +12,7 @@ from own_radar import GRID, OwnRadar
 
 from radejax.config import check_bins
 from radejax.core.errors import DataError, UserError
+from radejax.data.options import DataOptions
 from radejax.data.projection import LOG_OFFSET_DB, LOG_SCALE_DB
 from radejax.data.records import preprocess
 
@@ -31,6 +32,10 @@ def write(root: pathlib.Path, lines: list[str], power: np.ndarray) -> pathlib.Pa
     return root
 
 
+def read(root: pathlib.Path) -> OwnRadar:
+    return OwnRadar.from_options(DataOptions(roots=(str(root),)), own_radar.CLASSES)
+
+
 @pytest.fixture
 def power() -> np.ndarray:
     return np.random.default_rng(0).exponential(1e7, (64, 48, 16))
@@ -41,7 +46,7 @@ def test_boxes_are_in_the_radar_frame_and_power_in_decibels(
 ) -> None:
     lines = [f"0004_0001,car,{BOX}", f"0004_0001,pedestrian,{BOX}", f"9_1,car,{BOX}"]
     root = write(tmp_path, lines, power)
-    frames = OwnRadar([root]).with_valid_boxes(own_radar.CLASSES)
+    frames = read(root).with_valid_boxes(own_radar.CLASSES)
     assert frames.summary().counts["objects left out: class 'pedestrian'"] == 1
     assert frames[0].classes.tolist() == ["car"]
     np.testing.assert_allclose(
@@ -71,7 +76,7 @@ def test_boxes_are_in_the_radar_frame_and_power_in_decibels(
 def test_wrong_radar_files_are_skipped_with_the_reason(
     change, message: str, tmp_path: pathlib.Path, power: np.ndarray
 ) -> None:
-    frames = OwnRadar([write(tmp_path, [], change(power))], classes=("car",))
+    frames = read(write(tmp_path, [], change(power)))
     report = preprocess(frames, tmp_path / "records", progress=False)
     assert len(report.skipped) == 2
     assert all(re.search(message, reason) for reason in report.skipped.values())
@@ -80,7 +85,7 @@ def test_wrong_radar_files_are_skipped_with_the_reason(
 def test_a_wrong_line_is_named(tmp_path: pathlib.Path, power: np.ndarray) -> None:
     lines = [f"0004_0001,car,{BOX}", f"0004_0001,car,east{BOX}"]
     with pytest.raises(DataError, match=r"boxes.csv, line 3: .*convert string"):
-        OwnRadar([write(tmp_path, lines, power)], classes=("car",))
+        read(write(tmp_path, lines, power))
 
 
 def test_the_config_fits_the_radar() -> None:
@@ -102,7 +107,7 @@ def test_a_simulated_recording_is_trained_evaluated_and_drawn(
     metrics = json.loads((run / "evaluation" / "metrics.json").read_text())
     assert metrics["options"]["classes"] == ["car", "truck"]
     # In every drive with a car, it is where the power is.
-    frames = OwnRadar([root])
+    frames = read(root)
     gains = []
     for frame in frames.with_valid_boxes(("car",)):
         level = frame.read_projection(GRID).max(-1)

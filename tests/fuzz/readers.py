@@ -7,8 +7,8 @@ import shutil
 import numpy as np
 import safetensors.numpy
 
-from radejax.data.kradar import KRadar, conditions, dataset, labels, write
-from radejax.data.tesseract import project_file, read_projection_npy
+from radejax.data.kradar import KRadar, conditions, folders, labels, write
+from radejax.data.kradar.tesseract import project_file, read_projection_npy
 from radejax.geometry.camera import CameraCalibration
 from radejax.inference.saved import load_torch
 from radejax.weights import radenet_torch
@@ -106,9 +106,9 @@ READERS = {
 }
 READERS |= {
     "label zip": Reader(_label_zip, _read_label_zip, "*.zip", 150),
-    "split": _of_root(dataset.read_split, "split/train.txt"),
+    "split": _of_root(folders.read_split, "split/train.txt"),
     "calibration": _of_root(
-        dataset.read_calibration, "1/info_calib/calib_radar_lidar.txt"
+        folders.read_calibration, "1/info_calib/calib_radar_lidar.txt"
     ),
     "description": _of_root(conditions.read_description, "1/description.txt"),
     "camera yml": _of_root(_camera, "1/cam_1.yml"),

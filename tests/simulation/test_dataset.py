@@ -14,12 +14,11 @@ from PIL import Image
 
 from radejax import Detector, models
 from radejax.core.errors import UserError
-from radejax.data.cameras import CameraOptions
+from radejax.data.cameras import CameraOptions, camera_inputs
 from radejax.data.kradar import KRadar, read_labels
 from radejax.data.kradar.check import check_dataset
-from radejax.data.pipeline import camera_inputs
+from radejax.data.kradar.tesseract import read_tesseract
 from radejax.data.projection import project_tensor
-from radejax.data.tesseract import read_tesseract
 from radejax.inference.saved import SavedModel
 from radejax.simulation import dataset
 from radejax.simulation.camera.renderer import stereo_calibration

@@ -12,8 +12,8 @@ from PIL import Image
 
 from radejax.cli.main import main
 from radejax.core.errors import DataError, UserError
+from radejax.data.kradar.tesseract import read_tesseract
 from radejax.data.kradar.write import write_tesseract
-from radejax.data.tesseract import read_tesseract
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
 from radejax.simulation.fitting import fit_files

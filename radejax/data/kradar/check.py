@@ -18,8 +18,9 @@ from radejax.core.files import PathLike
 from radejax.core.structures import CLASSES, RARE_SHARE
 from radejax.data.dataset import Summary
 from radejax.data.kradar.conditions import KRADAR_CONDITIONS, UNKNOWN_CONDITIONS
-from radejax.data.kradar.dataset import Frame, KRadar, SequenceFolder, read_calibration
-from radejax.data.tesseract import check_frame
+from radejax.data.kradar.dataset import Frame, KRadar
+from radejax.data.kradar.folders import SequenceFolder, read_calibration
+from radejax.data.kradar.tesseract import check_frame
 from radejax.geometry.radar_grid import RadarGrid
 
 Rows = list[dict[str, Any]]
@@ -116,7 +117,7 @@ def check_dataset(
     summary, splits = data.summary(), _find_splits(data)
     groups = itertools.groupby(data, key=lambda frame: frame.sequence)
     frames = {number: list(group) for number, group in groups}
-    folders = data.folders
+    folders = dict(data.files.sequences)
     if any(options.get(name) is not None for name in ("sequence_numbers", "weather")):
         if not frames:
             raise UserError("no frames of these sequences and weathers")
@@ -145,9 +146,9 @@ def check_dataset(
             _check_conditions(number, own, summary)
         row = _row(number, folder, own, splits)
         rows.append(row | {"radar_corrupted": corrupted[number]})
-    names = [str(path) for path in data.roots]
+    names = [str(path) for path in data.files.roots]
     objects = _count_objects(data, splits)
-    return HealthReport(names, data.version, rows, objects, summary)
+    return HealthReport(names, data.files.version, rows, objects, summary)
 
 
 def _tensors(folder: SequenceFolder) -> list[pathlib.Path]:

@@ -14,15 +14,15 @@ from tqdm import tqdm
 from radejax.core.archives import read_npy
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import PathLike, as_path, atomic_write
-from radejax.data.kradar.dataset import (
+from radejax.data.kradar.folders import (
     find_release,
     find_sequences,
     is_elevation_axis_up,
     read_grid,
 )
+from radejax.data.kradar.reduced import polar_shape, strongest_points
+from radejax.data.kradar.tesseract import check_axes, read_polar
 from radejax.data.records import PreprocessReport
-from radejax.data.reduced import polar_shape, strongest_points
-from radejax.data.tesseract import check_axes, read_polar
 
 _LEFT_OUT = shutil.ignore_patterns("radar_tesseract", "DERA_tesseract", "records*")
 

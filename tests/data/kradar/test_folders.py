@@ -6,14 +6,14 @@ import zipfile
 import pytest
 
 from radejax.core.errors import DataError, UserError
-from radejax.data.kradar import KRadar, dataset, write
+from radejax.data.kradar import KRadar, folders, write
 from radejax.data.kradar.conditions import (
     KRADAR_CONDITIONS,
     WEATHERS,
     Conditions,
     read_description,
 )
-from radejax.data.kradar.dataset import read_calibration, read_split
+from radejax.data.kradar.folders import read_calibration, read_split
 from radejax.geometry.radar_grid import RadarGrid
 
 LABEL = "00004_00001"
@@ -45,7 +45,7 @@ def test_sequence_spread_over_roots(tmp_path):
     second = touch(b / "7/cam-front/cam-front_00001.png")
     touch(b / "12/description.txt")
     touch(b / "resources/readme.txt")
-    sequences = dataset.find_sequences([a, b])
+    sequences = folders.find_sequences([a, b])
     assert list(sequences) == [7, 12]
     seven = sequences[7]
     assert seven.find("radar_tesseract", "tesseract_00001.mat") == first
@@ -61,7 +61,7 @@ def test_own_labels_by_version(tmp_path, version, folder):
     touch(tmp_path / f"3/info_label/{LABEL}.txt")
     touch(tmp_path / f"3/info_label_v2/{LABEL}.txt")
     touch(tmp_path / "3/info_label/readme.txt")
-    found = dataset.find_own_labels(dataset.find_sequences([tmp_path]), version)
+    found = folders.find_own_labels(folders.find_sequences([tmp_path]), version)
     assert found == {(3, LABEL): tmp_path / f"3/{folder}/{LABEL}.txt"}
 
 
@@ -85,7 +85,7 @@ def test_label_revisions_in_their_layouts(tmp_path, layout, zipped):
     else:
         for name in names:
             touch(path / name, name)
-    found = dataset.find_labels(path)
+    found = folders.find_labels(path)
     assert list(found) == [(3, LABEL), (12, LABEL)]
     assert found[12, LABEL].read_text() == names[0]
     assert str(found[3, LABEL]) == f"{path}/{names[1]}"
@@ -93,12 +93,12 @@ def test_label_revisions_in_their_layouts(tmp_path, layout, zipped):
 
 def test_bad_label_sources(tmp_path):
     with pytest.raises(FileNotFoundError, match="none"):
-        dataset.find_labels(tmp_path / "none")
+        folders.find_labels(tmp_path / "none")
     with pytest.raises(DataError, match="not a folder or a zip file of labels"):
-        dataset.find_labels(touch(tmp_path / "labels.txt"))
+        folders.find_labels(touch(tmp_path / "labels.txt"))
     (tmp_path / "empty").mkdir()
     with pytest.raises(UserError, match="no label files in it"):
-        dataset.find_labels(tmp_path / "empty")
+        folders.find_labels(tmp_path / "empty")
 
 
 def test_a_frame_twice_names_both(tmp_path):
@@ -106,7 +106,7 @@ def test_a_frame_twice_names_both(tmp_path):
         touch(tmp_path / f"labels/{folder}/{LABEL}.txt")
     both = rf"frame 1/{LABEL} is there twice, as .*01/{LABEL}\.txt and .*1/{LABEL}\.txt"
     with pytest.raises(DataError, match=both):
-        dataset.find_labels(tmp_path / "labels")
+        folders.find_labels(tmp_path / "labels")
     path = tmp_path / "labels.zip"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr(f"1/{LABEL}.txt", "x")
@@ -115,11 +115,11 @@ def test_a_frame_twice_names_both(tmp_path):
     with pytest.raises(
         DataError, match=rf"as .*zip/1/{LABEL}.txt and .*/1/{LABEL}.txt"
     ):
-        dataset.find_labels(path)
+        folders.find_labels(path)
     for name in ("1", "01"):
         touch(tmp_path / f"root/{name}/description.txt")
     with pytest.raises(DataError, match=r"sequence 1 is there twice, as .*01 and .*1:"):
-        dataset.find_sequences([tmp_path / "root"])
+        folders.find_sequences([tmp_path / "root"])
 
 
 def test_one_bad_member_leaves_the_others(tmp_path):
@@ -328,4 +328,4 @@ def test_a_revision_of_links(tmp_path):
     touch(tmp_path / f"disk/7/{LABEL}.txt", HEADER)
     (tmp_path / "labels").mkdir()
     (tmp_path / "labels/7").symlink_to(tmp_path / "disk/7")
-    assert list(dataset.find_labels(tmp_path / "labels")) == [(7, LABEL)]
+    assert list(folders.find_labels(tmp_path / "labels")) == [(7, LABEL)]

@@ -9,11 +9,11 @@ import pytest
 from radejax.core.errors import UserError
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.check import check_dataset
-from radejax.data.kradar.dataset import SIMULATION_MARKER, is_elevation_axis_up
+from radejax.data.kradar.folders import SIMULATION_MARKER, is_elevation_axis_up
 from radejax.data.kradar.reduce import reduce_dataset
+from radejax.data.kradar.reduced import project_reduced, reduce_tensor, strongest_points
+from radejax.data.kradar.tesseract import read_tesseract
 from radejax.data.records import Records, open_projections, preprocess
-from radejax.data.reduced import project_reduced, reduce_tensor, strongest_points
-from radejax.data.tesseract import read_tesseract
 
 
 def reduced_root(source, out, release):

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import UserError
+from radejax.data.dataset import held_out
 from radejax.data.kradar import KRadar, dataset, write
-from radejax.data.kradar.dataset import held_out, read_split, split_by_rule
+from radejax.data.kradar.folders import read_split, split_by_rule
 from radejax.data.kradar.labels import read_label_file
 
 KEYS = [(1, f"{i:05d}_{i:05d}") for i in range(8)] + [(2, "00000_00000")]

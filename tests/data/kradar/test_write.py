@@ -4,7 +4,7 @@ import scipy.io
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from radejax.data.kradar import conditions, dataset, write
+from radejax.data.kradar import conditions, folders, write
 from radejax.data.kradar.labels import (
     LABEL_CLASSES,
     VERSIONS,
@@ -45,14 +45,14 @@ def test_labels_survive_writing_and_reading(tmp_path_factory, objects, version):
 
 def test_calibration_description_and_splits_survive(tmp_path):
     write.write_calibration(tmp_path / "c.txt", 32, -2.54, np.float64(0.3))
-    assert dataset.read_calibration(tmp_path / "c.txt") == (32, -2.54, 0.3)
+    assert folders.read_calibration(tmp_path / "c.txt") == (32, -2.54, 0.3)
     write.write_description(tmp_path / "d.txt", "urban", "night", "heavysnow")
     assert conditions.read_description(tmp_path / "d.txt") == conditions.Conditions(
         "urban", "night", "heavysnow"
     )
     write.write_splits(tmp_path, [(1, "00033_00001")], [(2, "00034_00002")])
-    assert dataset.read_split(tmp_path / "train.txt") == [(1, "00033_00001")]
-    assert dataset.read_split(tmp_path / "test.txt") == [(2, "00034_00002")]
+    assert folders.read_split(tmp_path / "train.txt") == [(1, "00033_00001")]
+    assert folders.read_split(tmp_path / "test.txt") == [(2, "00034_00002")]
 
 
 @pytest.mark.parametrize("compress", [False, True])

@@ -7,9 +7,7 @@ import pytest
 import scipy.io
 
 from radejax.core.errors import DataError
-from radejax.data.kradar.write import write_tesseract
-from radejax.data.projection import project_tensor
-from radejax.data.tesseract import (
+from radejax.data.kradar.tesseract import (
     Layout,
     _read_columns,
     check_frame,
@@ -18,6 +16,8 @@ from radejax.data.tesseract import (
     read_projection_npy,
     read_tesseract,
 )
+from radejax.data.kradar.write import write_tesseract
+from radejax.data.projection import project_tensor
 from radejax.geometry.radar_grid import RadarGrid
 
 SHAPE = (4, 6, 3, 5)

@@ -9,16 +9,16 @@ from hypothesis import strategies as st
 
 from radejax.config import load_module
 from radejax.core.errors import DataError, UserError
-from radejax.data import reduced
-from radejax.data.projection import project_tensor, to_log_scale
-from radejax.data.reduced import (
+from radejax.data.kradar import reduced
+from radejax.data.kradar.reduced import (
     EMPTY_LEVEL,
     is_reduced,
     project_reduced,
     reduce_tensor,
     strongest_points,
 )
-from radejax.data.tesseract import check_frame, read_frame
+from radejax.data.kradar.tesseract import check_frame, read_frame
+from radejax.data.projection import project_tensor, to_log_scale
 from radejax.geometry.radar_grid import RadarGrid
 
 KRADAR = RadarGrid.kradar()

@@ -31,20 +31,20 @@ from jaxtyping import Float, Real
 from radejax.core.archives import read_npy, wrap_read_errors
 from radejax.core.errors import DataError, require
 from radejax.core.files import PathLike, as_path
-from radejax.data.projection import (
-    MAX_LEVEL,
-    MAX_ZERO_SHARE,
-    find_problem,
-    project_columns,
-    project_tensor,
-)
-from radejax.data.reduced import (
+from radejax.data.kradar.reduced import (
     Polar,
     check_layout,
     is_reduced_file,
     project_reduced,
     reduce_tensor,
     to_polar,
+)
+from radejax.data.projection import (
+    MAX_LEVEL,
+    MAX_ZERO_SHARE,
+    find_problem,
+    project_columns,
+    project_tensor,
 )
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -160,7 +160,7 @@ def read_frame(path: PathLike, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
     """Return the float32 projection of a radar tensor, or of a file of another release.
 
     Files of `.npy` contain projections of the reference implementation or, by their names,
-    frames of K-Radar's reduced releases (see `radejax.data.reduced`).
+    frames of K-Radar's reduced releases (see `radejax.data.kradar.reduced`).
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -183,7 +183,7 @@ def check_axes(grid: RadarGrid) -> None:
 
 
 def read_polar(path: PathLike, grid: RadarGrid) -> Polar:
-    """Return mean power and mean Doppler of all cells, see `radejax.data.reduced`.
+    """Return mean power and mean Doppler of all cells, see `radejax.data.kradar.reduced`.
 
     Args:
         path: Radar tensor, or frame of a reduced release.
