@@ -1,4 +1,5 @@
 import dataclasses
+import functools
 import itertools
 import shutil
 import threading
@@ -87,14 +88,6 @@ def test_batches_are_the_records_and_labels(loader, records, data):
     assert batch.camera is None
 
 
-def test_splits_point_to_the_right_records(records, kradar_root):
-    test = KRadar(kradar_root, split="test")
-    table = make_table(records, test, max_objects=5)
-    batch = next(make_loader(table, dataclasses.replace(OPTIONS, shuffle=False)))
-    for row, index in enumerate(batch.frame):
-        np.testing.assert_array_equal(batch.projection[row], records[test[index].key])
-
-
 # Order --------------------------------------------------------------------------------
 
 
@@ -116,22 +109,6 @@ def test_order_depends_only_on_the_seed(loader):
     others = [frames_of(loader(num_epochs=2, seed=s)) for s in (0, 2, 3)]
     orders = [run[4 * e : 4 * e + 4] for run in [wanted, *others] for e in (0, 1)]
     assert all(a != b for a, b in itertools.combinations(orders, 2))
-
-
-def test_without_num_epochs_it_never_ends(loader):
-    endless = loader()
-    assert len([next(endless) for _ in range(30)]) == 30
-
-
-@pytest.mark.parametrize("count", [2, 4])
-def test_processes_share_every_epoch(loader, count):
-    options = {"num_epochs": 2, "process_count": count, "batch_size": 1}
-    shares = [frames_of(loader(process_index=i, **options)) for i in range(count)]
-    assert {len(share) for share in shares} == {2 * 12 // count}
-    for epoch in (0, 1):
-        half = slice(epoch * 12 // count, (epoch + 1) * 12 // count)
-        drawn = [frame for share in shares for (frame,) in share[half]]
-        assert sorted(drawn) == list(range(12))
 
 
 @pytest.mark.parametrize("count", [2, 3])
@@ -392,18 +369,6 @@ def test_images_and_cameras(records, data, tmp_path):
     assert IMAGE_SIZE == (720, 1280)
 
 
-# Errors -------------------------------------------------------------------------------
-
-
-def test_wrong_sizes(loader, records, data):
-    with pytest.raises(UserError, match="12 frames are fewer than one batch"):
-        loader(batch_size=13)
-    with pytest.raises(UserError, match=r"of 15 \(3 on each of 5 .*--config\.train"):
-        loader(process_count=5)
-    with pytest.raises(UserError, match="would do"):
-        make_table(records, data, max_objects=0)
-
-
 @pytest.mark.parametrize("num_threads", [0, 2])
 def test_a_corrupted_record_is_named_when_it_is_read(
     records, data, tmp_path, num_threads
@@ -457,19 +422,32 @@ def test_table_by_hand(written):
 
 
 @pytest.mark.wrong_types
-def test_too_many_objects_and_missing_records(written):
-    frames = [
-        frame_of("1/a", [BOX] * 2, ["Sedan"] * 2),
-        frame_of("1/b", [BOX] * 5, ["Sedan"] * 5),
-    ]
-    with pytest.raises(UserError, match=r"frame 1/b has 5 objects.* is 3; 5 would do"):
-        make_table(written, frames, max_objects=3)
-    # Objects of other classes take no rows.
-    make_table(written, frames, max_objects=0, classes=("Bicycle",))
-    with pytest.raises(UserError, match=r"1 of 2 frames have no record, .* is 1/x"):
-        make_table(written, [frames[0], frame_of("1/x")], max_objects=2)
-    with pytest.raises(UserError, match="no frames"):
-        make_table(written, [], max_objects=1)
-    images = types.SimpleNamespace(cameras=(None,))
-    with pytest.raises(UserError, match="1 cameras for 2 frames"):
-        make_table(written, frames, max_objects=5, images=images)
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda table, _: table([TWO, FIVE]), r"1/b has 5 objects.* is 3; 5 would do"),
+        (
+            lambda table, _: table([TWO, frame_of("1/x")]),
+            r"1 of 2 frames have no .* 1/x",
+        ),
+        (lambda table, _: table([]), "no frames"),
+        (
+            lambda table, _: table([TWO], images=types.SimpleNamespace(cameras=())),
+            "0 cameras for 1 frames",
+        ),
+        (lambda _, loader: loader(batch_size=13), "12 frames are fewer than one batch"),
+        (
+            lambda _, loader: loader(process_count=5),
+            r"of 15 \(3 on each of 5 .*--config",
+        ),
+    ],
+)
+def test_wrong_sizes(written, loader, call, message):
+    table = functools.partial(make_table, written, max_objects=3)
+    with pytest.raises(UserError, match=message):
+        call(table, loader)
+    table([TWO, FIVE], classes=("Bicycle",))  # objects of other classes take no rows
+
+
+TWO = frame_of("1/a", [BOX] * 2, ["Sedan"] * 2)
+FIVE = frame_of("1/b", [BOX] * 5, ["Sedan"] * 5)

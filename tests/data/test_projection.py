@@ -13,7 +13,6 @@ from radejax.data.projection import (
     ENCODINGS,
     decode,
     encode,
-    project_columns,
     project_jax,
     project_tensor,
     to_log_scale,
@@ -77,13 +76,6 @@ def test_equals_the_plain_formula(layout, dtype):
         np.testing.assert_array_equal(found, wanted.astype(np.float32))
 
 
-def test_input_is_left_as_it_is():
-    tesseract = random_power()
-    copy = tesseract.copy()
-    project_tensor(tesseract)
-    np.testing.assert_array_equal(tesseract, copy)
-
-
 @settings(deadline=None, max_examples=50)
 @given(
     cells=st.lists(
@@ -113,19 +105,6 @@ def test_other_types(dtype):
     tesseract = np.arange(np.prod(SHAPE)).reshape(SHAPE).astype(dtype)
     wanted = project_released(tesseract.astype(np.float64))
     np.testing.assert_allclose(project_tensor(tesseract), wanted, atol=1e-6)
-
-
-def test_columns_one_by_one_in_the_same_buffer():
-    tesseract = np.asfortranarray(random_power())
-    buffer = np.empty(SHAPE[2::-1], np.float32)  # [E, R, D]
-
-    def columns():
-        for i in range(SHAPE[3]):
-            buffer[:] = tesseract[..., i].T
-            yield buffer
-
-    found = project_columns(columns(), SHAPE)
-    np.testing.assert_array_equal(found, project_tensor(tesseract))
 
 
 def test_jax_on_one_frame_and_on_batches():

@@ -1,12 +1,10 @@
 """Records: one file per frame, resumable, sharded, never half written."""
 
-import concurrent.futures
 import dataclasses
 import errno
 import json
 import multiprocessing
 import os
-import pickle
 import shutil
 import signal
 import subprocess
@@ -19,8 +17,6 @@ import pytest
 
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
-from radejax.core.workers import process_pool
-from radejax.data import records as records_module
 from radejax.data.dataset import LabelledFrames
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.tesseract import project_file, read_tesseract
@@ -84,26 +80,6 @@ def test_every_frame_is_its_projection(data, folder):
         records["1/none"]
 
 
-def test_threads_and_pickles_read_the_same(data, folder):
-    records = open_projections(folder)
-    wanted = [records[frame.key] for frame in data]
-    copy = pickle.loads(pickle.dumps(records))
-    with concurrent.futures.ThreadPoolExecutor(8) as pool:
-        found = list(pool.map(lambda i: copy[data[i % 12].key], range(96)))
-    for i, projection in enumerate(found):
-        np.testing.assert_array_equal(projection, wanted[i % 12])
-
-
-def test_another_grid_is_an_error(folder, data):
-    with pytest.raises(
-        UserError, match=r"6 x 16 x 5 x 12 bins.*expected 64 x 256 x 37"
-    ):
-        open_projections(folder, RadarGrid.kradar())
-    moved = dataclasses.replace(data.grid, range_m=data.grid.range_m * 1.1)
-    with pytest.raises(UserError, match=r"to 118\.00 m.*to 129\.80 m"):
-        open_projections(folder, moved)
-
-
 def test_corrupted_records_are_named(data, copy):
     records, key = open_projections(copy), data[4].key
     path = records.path(key)
@@ -145,7 +121,7 @@ def test_corrupted_descriptions_are_named(copy, change, message):
         open_projections(copy)
 
 
-def test_projections_are_no_embeddings(folder):
+def test_projections_are_not_embeddings(folder):
     with pytest.raises(DataError, match="not embeddings of images"):
         open_embeddings(folder)
 
@@ -163,25 +139,6 @@ def test_processes_shards_and_one_process_write_the_same(data, folder, tmp_path)
     for index in (1, 0):
         assert run(data, tmp_path / "shards", shard=(index, 2)).num_frames == 6
     assert contents(tmp_path / "shards") == wanted
-
-
-def test_large_jobs_have_as_many_workers_as_cpus_and_memory_allow(
-    data, folder, tmp_path, monkeypatch
-):
-    numbers = []
-
-    def pool(num_workers):
-        numbers.append(num_workers)
-        return process_pool(num_workers)
-
-    monkeypatch.setattr(records_module, "process_pool", pool)
-    monkeypatch.setattr(records_module, "default_workers", lambda: 2)
-    run(data, tmp_path / "small", num_workers=None)
-    assert numbers == []
-    monkeypatch.setattr(records_module, "_SMALL_JOB_BINS", 0)
-    run(data, tmp_path / "large", num_workers=None)
-    assert numbers == [2]
-    assert contents(tmp_path / "large") == contents(folder)
 
 
 def test_another_run_writes_what_is_missing(data, folder, copy):
@@ -340,14 +297,34 @@ def test_a_folder_of_a_failed_call_is_used(data, tmp_path):
         Records.create(tmp_path, (2, 4), "float16", {})
 
 
-def test_wrong_arguments(data, tmp_path):
-    with pytest.raises(UserError, match="no frames to preprocess"):
-        run(LabelledFrames([], data.grid), tmp_path)
-    with pytest.raises(UserError, match="dtype is 'int4', expected one of float16"):
-        run(data, tmp_path, dtype="int4")
-    for shard in ((2, 2), (-1, 2)):
-        with pytest.raises(UserError, match="i from 0 to n - 1"):
-            run(data, tmp_path, shard=shard)
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda data, _: run(LabelledFrames([], data.grid), "x"),
+            "no frames to preproc",
+        ),
+        (
+            lambda data, _: run(data, "x", dtype="int4"),
+            "dtype is 'int4', expected one of",
+        ),
+        (lambda data, _: run(data, "x", shard=(2, 2)), "i from 0 to n - 1"),
+        (lambda data, _: run(data, "x", shard=(-1, 2)), "i from 0 to n - 1"),
+        (
+            lambda _, folder: open_projections(folder, RadarGrid.kradar()),
+            r"6 x 16 x 5 x 12 bins.*expected 64 x 256 x 37",
+        ),
+        (
+            lambda data, folder: open_projections(
+                folder, dataclasses.replace(data.grid, range_m=data.grid.range_m * 1.1)
+            ),
+            r"to 118\.00 m.*to 129\.80 m",
+        ),
+    ],
+)
+def test_wrong_arguments(data, folder, call, message):
+    with pytest.raises(UserError, match=message):
+        call(data, folder)
 
 
 def test_a_full_disk_keeps_nothing_half_written(data, tmp_path, monkeypatch):

@@ -148,7 +148,7 @@ def check_dataset(
         rows.append(row | {"radar_corrupted": corrupted[number]})
     names = [str(path) for path in data.files.roots]
     objects = _count_objects(data, splits)
-    return HealthReport(names, data.files.version, rows, objects, summary)
+    return HealthReport(names, data.files.options.version, rows, objects, summary)
 
 
 def _tensors(folder: SequenceFolder) -> list[pathlib.Path]:

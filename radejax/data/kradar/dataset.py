@@ -136,32 +136,36 @@ class ReadOptions:
     common_camera: bool = False
 
     def __post_init__(self) -> None:
-        normalize_version(self.version)
-        flags = VISIBILITY_FLAGS if self.visibility is None else self.visibility
-        known = f"some of {VISIBILITY_FLAGS}, or None"
-        are_known = set(flags) <= set(VISIBILITY_FLAGS)
-        require(are_known, "visibility", self.visibility, known)
-        are_known = bool(self.classes) and set(self.classes) <= set(LABEL_CLASSES)
-        require(are_known, "classes", tuple(self.classes), f"some of {LABEL_CLASSES}")
+        object.__setattr__(self, "version", normalize_version(self.version))
+        if self.visibility is not None:
+            _require_known("visibility", self.visibility, VISIBILITY_FLAGS)
         if self.weather is not None:
             check_weather(self.weather)
+        _require_known("classes", self.classes, LABEL_CLASSES)
+        require(bool(self.classes), "classes", (), "at least one")
+
+
+def _require_known(name: str, values: Collection[str], known: Sequence[str]) -> None:
+    is_known = not isinstance(values, str) and set(values) <= set(known)
+    is_different = len(set(values)) == len(values)
+    expected = f"different ones of {', '.join(known)}"
+    require(is_known and is_different, name, values, expected)
 
 
 # Reading -----------------------------------------------------------------------------
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Index:
+class Index(NamedTuple):
     """The files of a K-Radar copy.
 
     Attributes:
         roots: Folders that contain the sequences.
         options: Options of reading them.
-        version: Version of the labels, such as "v2.1".
         sequences: Folders of every sequence in the roots, by sequence number.
         label_paths: Label files, sorted by sequence and frame.
-        label_source: Description of the place of the labels for messages.
-        split_folders: Folders in which split files are searched.
+        label_source: Folder or zip of the label revision, or "the sequences' own folders".
+        split_folders: Folders in which split files are searched: the roots and those of
+            the label revision.
         grid: Sensor axes of K-Radar, or of the `radar_grid.json` in a root.
         release: Reduced release that the roots contain ("polar3d" or "rpc"), or None.
         simulated_z_m: z of `radar_from_lidar_m` of a simulated dataset, or None.
@@ -170,7 +174,6 @@ class Index:
 
     roots: Sequence[pathlib.Path]
     options: ReadOptions
-    version: str
     sequences: Mapping[int, folders.SequenceFolder]
     label_paths: Mapping[Key, LabelPath]
     label_source: str
@@ -185,33 +188,29 @@ def scan(
     roots: Sequence[pathlib.Path], label_source: PathLike | None, options: ReadOptions
 ) -> Index:
     """Finds the files of a K-Radar copy; see `KRadar` for arguments and errors."""
-    version = normalize_version(options.version)
     sequences = folders.find_sequences(roots)
     release = folders.find_release(sequences)
     names = ", ".join(map(str, roots))
     if not sequences and (roots or label_source is None):
         raise UserError(f"no sequence folders (1, 2, ...) in the roots: {names}")
     split_folders = list(roots)
-    if label_source is None:
-        label_paths = folders.find_own_labels(sequences, version)
-        if not label_paths:
-            raise UserError(
-                f"no {version} labels in the sequence folders of {names} "
-                "(info_label/*.txt); give the folder or zip of a label revision: --labels"
-            )
-    else:
+    if label_source is not None:
         path = as_path(label_source)
         label_paths = folders.find_labels(path)
         split_folders += [path, path.parent]
+    elif not (label_paths := folders.find_own_labels(sequences, options.version)):
+        raise UserError(
+            f"no {options.version} labels in the sequence folders of {names} "
+            "(info_label/*.txt); give the folder or zip of a label revision: --labels"
+        )
     read_labels = functools.partial(
         read_label_file,
-        version=version,
+        version=options.version,
         include_unstarred=options.include_unstarred_v11_labels,
     )
     return Index(
         roots=roots,
         options=options,
-        version=version,
         sequences=sequences,
         label_paths=label_paths,
         label_source=str(label_source or "the sequences' own folders"),
@@ -586,17 +585,14 @@ class KRadar(LabelledFrames[Frame]):
     @classmethod
     def check_options(cls, options: DataOptions, classes: Sequence[str]) -> None:
         """Raises `UserError` if a label version, flag, weather or class is unknown."""
-        versions = (*VERSIONS, *(version.removeprefix("v") for version in VERSIONS))
-        for name, value, known in (
-            ("data.label_version", options.label_version, versions),
-            ("data.visibility", options.visibility, VISIBILITY_FLAGS),
-            ("data.weather", options.weather, WEATHERS),
-            ("classes", classes, LABEL_CLASSES),
-        ):
-            values = (value,) if isinstance(value, str) else value or ()
-            is_known = set(values) <= set(known) and len(set(values)) == len(values)
-            expected = f"different ones of {', '.join(known)}"
-            require(is_known, f"config.{name}", value, expected)
+        version = options.label_version
+        is_version = f"v{version.removeprefix('v')}" in VERSIONS
+        expected = f"one of {', '.join(VERSIONS)}"
+        require(is_version, "config.data.label_version", version, expected)
+        _require_known("config.data.weather", options.weather, WEATHERS)
+        visibility = options.visibility or ()
+        _require_known("config.data.visibility", visibility, VISIBILITY_FLAGS)
+        _require_known("config.classes", classes, LABEL_CLASSES)
 
     def of_split(self, split: PathLike | None) -> KRadar:
         """Returns the frames of another split of the same files.

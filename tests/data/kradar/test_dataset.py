@@ -105,19 +105,55 @@ def test_frame_knows_its_files(kradar_root):
     assert not data.summary().problems
 
 
-def test_camera_frame_number_comes_from_the_header(tmp_path):
-    write_frame(tmp_path, [])
-    image = tmp_path / "1/cam-front/cam-front_00002.png"
-    npy = tmp_path / "1/DERA_tesseract/DERA_tesseract_00004.npy"
-    for path in (image, npy):
-        path.parent.mkdir()
-        path.touch()
-    (frame,) = KRadar(tmp_path)
-    assert frame.camera_path == image
-    assert frame.projection_path == npy
-
-
 # What is missing or malformed -------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda root: KRadar(None), "no sequence folders"),
+        (lambda root: KRadar(root.parent), "no sequence folders"),
+        (
+            lambda root: KRadar(root / "no_labels"),
+            r"no v2\.1 labels in the sequence fold",
+        ),
+        (lambda root: KRadar(root / "none"), "none"),
+        (lambda root: KRadar(root, version="v9"), "version 'v9' does not exist"),
+        (
+            lambda root: KRadar(root, split="validation"),
+            "'validation' is neither 'train',",
+        ),
+        (
+            lambda root: KRadar(root, visibility="L1"),
+            "visibility is 'L1', expected diff",
+        ),
+        (
+            lambda root: KRadar(root, classes=("Car",)),
+            r"classes is \('Car',\), expected di",
+        ),
+        (
+            lambda root: KRadar(root, classes=()),
+            r"classes is \(\), expected at least one",
+        ),
+        (lambda root: KRadar(root, weather=("mist",)), r"unknown weather \('mist',\)"),
+        (lambda root: KRadar(root, weather=()), "unknown weather"),
+        (
+            lambda root: KRadar(root, sequence_numbers=[9]),
+            r"no labels .*\[9\]; .*\[1\]",
+        ),
+        (
+            lambda root: KRadar(root),
+            r"not an object of v2\.1 .*--config\.data\.label_vers",
+        ),
+    ],
+)
+def test_what_cannot_be_read_is_one_error(tmp_path, call, message):
+    root = tmp_path / "root"
+    write_frame(root, [sedan(10, 0), sedan(20, 0)], "v2.0")
+    (root / "no_labels/1").mkdir(parents=True)
+    with pytest.raises((UserError, FileNotFoundError), match=message):
+        call(root)
+    assert len(KRadar(root, version="v2.0")[0].boxes) == 2
 
 
 def test_problems_are_counted_and_named(tmp_path, kradar_writer):
@@ -149,44 +185,6 @@ def test_problems_are_counted_and_named(tmp_path, kradar_writer):
     assert json.loads(json.dumps(summary.to_dict()))["counts"]["frames"] == 5
     assert data[3].tesseract_path is not None
     assert data[2].tesseract_path is None
-
-
-def test_labels_of_another_version_are_one_error(tmp_path):
-    write_frame(tmp_path, [sedan(10, 0), sedan(20, 0)], "v2.0")
-    with pytest.raises(
-        UserError, match=r"not an object of v2\.1 .*--config\.data\.label_version"
-    ):
-        KRadar(tmp_path)
-    assert len(KRadar(tmp_path, version="v2.0")[0].boxes) == 2
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"root": None}, "no sequence folders"),
-        ({"version": "v9"}, "version 'v9' does not exist"),
-        ({"split": "validation"}, "'validation' is neither 'train', 'test'"),
-        ({"visibility": "L1"}, "visibility is 'L1', expected some"),
-        ({"classes": ("Car",)}, r"classes is \('Car',\), expected some of"),
-        ({"classes": ()}, r"classes is \(\), expected"),
-        ({"weather": ("mist",)}, r"unknown weather \('mist',\)"),
-        ({"weather": ()}, "unknown weather"),
-        ({"sequence_numbers": [9]}, r"no labels .*sequences \[9\]; .*\[1, 2\]"),
-    ],
-)
-def test_wrong_arguments(kradar_root, arguments, message):
-    with pytest.raises(UserError, match=message):
-        KRadar(**{"root": kradar_root, **arguments})
-
-
-def test_nothing_to_read(tmp_path):
-    with pytest.raises(UserError, match="no sequence folders"):
-        KRadar(tmp_path)
-    (tmp_path / "1").mkdir()
-    with pytest.raises(UserError, match=r"no v2\.1 labels in the sequence folders"):
-        KRadar([tmp_path])
-    with pytest.raises(FileNotFoundError, match="none"):
-        KRadar(tmp_path / "none")
 
 
 # The reference data -----------------------------------------------------------------

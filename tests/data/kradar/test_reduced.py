@@ -18,7 +18,7 @@ from radejax.data.kradar.reduced import (
     strongest_points,
 )
 from radejax.data.kradar.tesseract import check_frame, read_frame
-from radejax.data.projection import project_tensor, to_log_scale
+from radejax.data.projection import project_tensor
 from radejax.geometry.radar_grid import RadarGrid
 
 KRADAR = RadarGrid.kradar()
@@ -259,18 +259,6 @@ def test_the_head_shows_shape_and_type(tmp_path):
     path.write_bytes(path.read_bytes()[:-8])
     with pytest.raises(DataError, match="corrupted"):
         check_frame(path, GRID)
-
-
-def test_levels_are_those_of_the_projection():
-    power = np.float32([1e-4, 3.0])
-    found = to_log_scale(power * np.float32(reduced.POWER_UNIT))
-    np.testing.assert_allclose(found, level_of(power.astype(float)), atol=1e-6)
-
-
-def test_files_tell_their_form_by_their_names():
-    names = ("polar3d_00001.npy", "a/rpc_00001.npy", "tesseract_00001.mat", "x.npy")
-    found = [reduced.release_of_file(name) for name in names]
-    assert found == ["polar3d", "rpc", None, None]
 
 
 @pytest.mark.parametrize("found", ["rpc", None])
