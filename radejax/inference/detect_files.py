@@ -321,11 +321,11 @@ def _frames(
         roots=tuple(map(str, roots)),
         labels=None if labels is None else str(labels),
         camera_calibration=camera_calibration and str(camera_calibration),
+        sequences=tuple(part["sequence_numbers"] or ()),
+        weather=tuple(part["weather"] or ()),
     )
-    reader = find_reader(options.format)
-    frames = reader.from_options(options, config.classes).part(
-        part["sequence_numbers"], part["weather"]
-    )
+    frames = find_reader(options.format).from_options(options, config.classes)
+    frames = frames.part(options.sequences, options.weather)
     if not len(frames):
         named = ", ".join(map(str, roots))
         raise UserError(f"no frames in {named}: give the roots of the dataset")

@@ -151,7 +151,8 @@ def test_off_is_off():
 
 def test_padding_stays_zero():
     padded = np.zeros((3, 8), np.float32)
-    before = dataclasses.replace(sample(np.zeros((0, 8))), boxes=padded)
+    classes = np.full(3, -1)
+    before = dataclasses.replace(sample(padded[:0]), boxes=padded, classes=classes)
     boxes = mirror(before).boxes
     np.testing.assert_array_equal(boxes, padded)
     assert boxes.dtype == np.float32

@@ -2,7 +2,6 @@ import dataclasses
 import functools
 import itertools
 import shutil
-import threading
 import types
 
 import chex
@@ -14,7 +13,6 @@ from PIL import Image
 
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import CLASSES, Batch
-from radejax.data import pipeline
 from radejax.data.augment import Augmentation
 from radejax.data.cameras import IMAGE_SIZE, CameraOptions, camera_inputs
 from radejax.data.kradar import KRadar
@@ -267,41 +265,6 @@ def test_state_travels_with_an_orbax_checkpoint(loader, tmp_path):
             5, args=ocp.args.Composite(data=grain.checkpoint.CheckpointRestore(second))
         )
     assert frames_of(second) == frames_of(first)
-
-
-# Threads -----------------------------------------------------------------------------
-
-
-class Meeting(Records):
-    """Records of which the first are read only when all threads read one at that time."""
-
-    def __getitem__(self, key):
-        barrier = self.source["barrier"]
-        if next(self.source["count"]) < barrier.parties:
-            barrier.wait(20)
-        return super().__getitem__(key)
-
-
-@pytest.mark.parametrize(
-    ("num_threads", "batch_size"), [(3, 12), (3, 3), (3, 1), (4, 2), (2, 5)]
-)
-def test_all_threads_read_frames_at_the_same_time(
-    records, data, monkeypatch, num_threads, batch_size
-):
-    """By default as many as there are CPUs, and from the first batch on."""
-    barrier = threading.Barrier(num_threads)
-    source = {**records.source, "barrier": barrier, "count": itertools.count()}
-    meeting = Meeting(records.folder, records.shape, records.dtype, source)
-    options = dataclasses.replace(OPTIONS, batch_size=batch_size, num_epochs=2)
-    assert options.num_threads is None
-    wanted = make_loader(
-        make_table(records, data, max_objects=5),
-        dataclasses.replace(options, num_threads=0),
-    )
-    monkeypatch.setattr(pipeline, "usable_cpus", lambda: num_threads)
-    loader = make_loader(make_table(meeting, data, max_objects=5), options)
-    for found, batch in zip(loader, wanted, strict=True):
-        chex.assert_trees_all_equal(found, batch)
 
 
 # Options ------------------------------------------------------------------------------

@@ -153,11 +153,6 @@ def test_the_strongest_cells_are_the_same_in_every_form(tmp_path, form):
     np.testing.assert_array_equal(found, expected)
 
 
-def test_all_points_of_a_file_are_returned_if_it_has_fewer(tmp_path):
-    path = radar_file(tmp_path, "rpc", noise_with_echo())
-    np.testing.assert_array_equal(read_points(path, GRID, rate=0.5), np.load(path))
-
-
 @pytest.mark.parametrize("form", ["tesseract", "DERA_tesseract", "polar3d", "rpc"])
 def test_cfar_finds_the_echo_in_every_form(tmp_path, form):
     path = radar_file(tmp_path, form, noise_with_echo())
@@ -192,28 +187,22 @@ def test_z_is_that_of_an_axis_that_points_up_or_down(tmp_path, form, method):
     np.testing.assert_array_equal(project_reduced(up[None], GRID), expected)
 
 
-def test_projections_have_no_mean_power(tmp_path):
-    path = radar_file(tmp_path, "DERA_tesseract", noise_with_echo())
-    with pytest.raises(DataError, match="a projection, which has no mean power"):
-        read_points(path, GRID)
+FLAT = small.uneven_grid(elevation_rad=np.array([]))
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
-    [({"method": "peaks"}, "method is 'peaks'"), ({"rate": 1.0}, r"rate is 1\.0")],
+    ("form", "grid", "options", "message"),
+    [
+        ("polar3d", GRID, {"method": "peaks"}, "method is 'peaks'"),
+        ("polar3d", GRID, {"rate": 1.0}, r"rate is 1\.0"),
+        ("tesseract", FLAT, {}, "shape of the radar's grid is"),
+        ("DERA_tesseract", GRID, {}, "a projection, which has no mean power"),
+    ],
 )
-def test_invalid_options_are_named(tmp_path, options, message):
-    path = radar_file(tmp_path, "polar3d", noise_with_echo())
-    with pytest.raises(UserError, match=message):
-        read_points(path, GRID, **options)
-
-
-def test_percentiles_need_doppler_and_elevation_bins(tmp_path):
-    path = tmp_path / "tesseract_00001.mat"
-    grid = small.uneven_grid(elevation_rad=np.array([]))
-    write_tesseract(path, np.ones(grid.shape_drea, np.float32))
-    with pytest.raises(UserError, match="shape of the radar's grid is"):
-        read_points(path, grid)
+def test_what_gives_no_points_is_named(tmp_path, form, grid, options, message):
+    path = radar_file(tmp_path, form, noise_with_echo())
+    with pytest.raises((DataError, UserError), match=message):
+        read_points(path, grid, **options)
 
 
 @pytest.mark.parametrize("count", [0, 3])

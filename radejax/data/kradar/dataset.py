@@ -24,15 +24,7 @@ from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import PathLike, as_path
 from radejax.core.structures import CLASSES
 from radejax.data.dataset import LabelledFrame, LabelledFrames, Summary
-from radejax.data.kradar import folders
-from radejax.data.kradar.conditions import (
-    KRADAR_CONDITIONS,
-    UNKNOWN_CONDITIONS,
-    WEATHERS,
-    Conditions,
-    check_weather,
-    read_description,
-)
+from radejax.data.kradar import conditions, folders
 from radejax.data.kradar.labels import (
     LABEL_CLASSES,
     VERSIONS,
@@ -140,7 +132,7 @@ class ReadOptions:
         if self.visibility is not None:
             _require_known("visibility", self.visibility, VISIBILITY_FLAGS)
         if self.weather is not None:
-            check_weather(self.weather)
+            conditions.check_weather(self.weather)
         _require_known("classes", self.classes, LABEL_CLASSES)
         require(bool(self.classes), "classes", (), "at least one")
 
@@ -316,7 +308,7 @@ def read(index: Index, keys: Iterable[Key]) -> tuple[list[Frame], Summary]:
         for number in sorted({number for number, _ in keys})
     }
     if (weather := index.options.weather) is not None:
-        kept = [key for key in keys if sequences[key[0]].conditions.weather in weather]
+        kept = [key for key in keys if sequences[key[0]].weather in weather]
         summary.counts["frames left out by weather"] = len(keys) - len(kept)
         keys = kept
     files = _read_label_files(index, keys, summary)
@@ -330,7 +322,9 @@ def read(index: Index, keys: Iterable[Key]) -> tuple[list[Frame], Summary]:
 class _Sequence(NamedTuple):
     """What the frames of a sequence share."""
 
-    conditions: Conditions
+    environment: str
+    time: str
+    weather: str
     radar_from_lidar_m: tuple[float, float, float]
     camera_calibration_path: pathlib.Path | None
 
@@ -364,16 +358,17 @@ def _read_sequence(index: Index, number: int, summary: Summary) -> _Sequence:
         calibration = (0, *RADAR_FROM_LIDAR_M[:2])
     _, dx_m, dy_m = calibration
     path = folder.find(".", "description.txt")
-    conditions = _read_or_report(read_description, path, "description", summary)
-    if conditions is None:
+    read_description = conditions.read_description
+    found = _read_or_report(read_description, path, "description", summary)
+    if found is None:
         counts["sequences with built-in conditions"] += 1
-        conditions = KRADAR_CONDITIONS.get(number, UNKNOWN_CONDITIONS)
-    elif conditions.weather not in (*WEATHERS, "unknown"):
+        found = conditions.KRADAR_CONDITIONS.get(number, conditions.UNKNOWN_CONDITIONS)
+    elif found.weather not in (*conditions.WEATHERS, "unknown"):
         summary.notes.append(
-            f"{path}: weather {conditions.weather!r} is none of K-Radar's: "
-            f"{', '.join(WEATHERS)}"
+            f"{path}: weather {found.weather!r} is none of K-Radar's: "
+            f"{', '.join(conditions.WEATHERS)}"
         )
-    return _Sequence(conditions, (dx_m, dy_m, 0.0), camera)
+    return _Sequence(*found, (dx_m, dy_m, 0.0), camera)
 
 
 def _read_or_report(
@@ -455,11 +450,9 @@ def _make_frame(
         projection_path=projection,
         radar_path=tesseract or projection,
         camera_path=camera,
-        camera_calibration_path=sequence.camera_calibration_path,
-        radar_from_lidar_m=sequence.radar_from_lidar_m,
         radar_from_lidar_z_m=KRADAR_RADAR_FROM_LIDAR_Z_M if z_m is None else z_m,
         is_simulated=z_m is not None,
-        **sequence.conditions._asdict(),
+        **sequence._asdict(),
     )
 
 
@@ -589,7 +582,7 @@ class KRadar(LabelledFrames[Frame]):
         is_version = f"v{version.removeprefix('v')}" in VERSIONS
         expected = f"one of {', '.join(VERSIONS)}"
         require(is_version, "config.data.label_version", version, expected)
-        _require_known("config.data.weather", options.weather, WEATHERS)
+        _require_known("config.data.weather", options.weather, conditions.WEATHERS)
         visibility = options.visibility or ()
         _require_known("config.data.visibility", visibility, VISIBILITY_FLAGS)
         _require_known("config.classes", classes, LABEL_CLASSES)

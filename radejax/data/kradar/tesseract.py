@@ -31,14 +31,7 @@ from jaxtyping import Float, Real
 from radejax.core.archives import read_npy, wrap_read_errors
 from radejax.core.errors import DataError, require
 from radejax.core.files import PathLike, as_path
-from radejax.data.kradar.reduced import (
-    Polar,
-    check_layout,
-    is_reduced_file,
-    project_reduced,
-    reduce_tensor,
-    to_polar,
-)
+from radejax.data.kradar import reduced
 from radejax.data.projection import (
     MAX_LEVEL,
     MAX_ZERO_SHARE,
@@ -169,8 +162,8 @@ def read_frame(path: PathLike, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
     if pathlib.Path(path).suffix != ".npy":
         projection = project_file(path, shape_drea=grid.shape_drea)
         return grid.measured_channels(projection)
-    if is_reduced_file(path):
-        return project_reduced(read_npy(path, mapped=True), grid, str(path))
+    if reduced.is_reduced_file(path):
+        return reduced.project_reduced(read_npy(path, mapped=True), grid, str(path))
     projection = read_projection_npy(path, projection_shape=grid.projection_shape)
     return projection.astype(np.float32)
 
@@ -182,7 +175,7 @@ def check_axes(grid: RadarGrid) -> None:
     require(least > 0, "shape of the radar's grid", grid.shape_drea, expected)
 
 
-def read_polar(path: PathLike, grid: RadarGrid) -> Polar:
+def read_polar(path: PathLike, grid: RadarGrid) -> reduced.Polar:
     """Return mean power and mean Doppler of all cells, see `radejax.data.kradar.reduced`.
 
     Args:
@@ -196,14 +189,14 @@ def read_polar(path: PathLike, grid: RadarGrid) -> Polar:
             projection, which has no mean power.
     """
     check_axes(grid)
-    if is_reduced_file(path):
-        return to_polar(read_npy(path), grid, str(path))
+    if reduced.is_reduced_file(path):
+        return reduced.to_polar(read_npy(path), grid, str(path))
     if pathlib.Path(path).suffix == ".npy":
         raise DataError(
             f"{path}: a projection, which has no mean power of cells; expected a radar "
             "tensor, polar3d or rpc file"
         )
-    return reduce_tensor(read_power(path, grid), grid)
+    return reduced.reduce_tensor(read_power(path, grid), grid)
 
 
 def read_power(path: PathLike, grid: RadarGrid) -> Real[np.ndarray, "D R E A"]:
@@ -226,8 +219,8 @@ def check_frame(path: PathLike, grid: RadarGrid, *, deep: bool = False) -> None:
     """
     if deep:
         read_frame(path, grid)
-    elif is_reduced_file(path):
-        check_layout(read_npy(path, mapped=True), grid, str(path))
+    elif reduced.is_reduced_file(path):
+        reduced.check_layout(read_npy(path, mapped=True), grid, str(path))
     elif pathlib.Path(path).suffix == ".npy":
         _projection_axes(path, read_npy(path, mapped=True), grid.projection_shape)
     else:

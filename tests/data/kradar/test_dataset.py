@@ -103,6 +103,21 @@ def test_frame_knows_its_files(kradar_root):
     assert [f.key for f in data[:2]] == ["1/00004_00001", "1/00005_00002"]
     assert data.counts["frames without front image"] == 8
     assert not data.summary().problems
+    with pytest.raises(FileNotFoundError, match=r"no os2-64/os2-64_00001\.pcd in any"):
+        data.lidar_path(frame)
+
+
+def test_the_header_names_the_files_of_a_frame(tmp_path):
+    write_frame(tmp_path, [])  # radar 4, LiDAR 1, camera 2
+    image = tmp_path / "1/cam-front/cam-front_00002.png"
+    npy = tmp_path / "1/DERA_tesseract/DERA_tesseract_00004.npy"
+    scan = tmp_path / "1/os2-64/os2-64_00001.pcd"
+    for path in (image, npy, scan):
+        path.parent.mkdir()
+        path.touch()
+    (frame,) = data = KRadar(tmp_path)
+    found = frame.camera_path, frame.projection_path, data.lidar_path(frame)
+    assert found == (image, npy, scan)
 
 
 # What is missing or malformed -------------------------------------------------------

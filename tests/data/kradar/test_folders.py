@@ -38,21 +38,6 @@ def touch(path: pathlib.Path, text: str = "x") -> pathlib.Path:
 # Sequences and their labels ---------------------------------------------------------
 
 
-def test_sequence_spread_over_roots(tmp_path):
-    a, b = tmp_path / "a", tmp_path / "b"
-    first = touch(a / "7/radar_tesseract/tesseract_00001.mat")
-    touch(b / "7/radar_tesseract/tesseract_00001.mat")
-    second = touch(b / "7/cam-front/cam-front_00001.png")
-    touch(b / "12/description.txt")
-    touch(b / "resources/readme.txt")
-    sequences = folders.find_sequences([a, b])
-    assert list(sequences) == [7, 12]
-    seven = sequences[7]
-    assert seven.find("radar_tesseract", "tesseract_00001.mat") == first
-    assert seven.find("cam-front", "cam-front_00001.png") == second
-    assert seven.find("cam-front", "cam-front_00002.png") is None
-
-
 @pytest.mark.parametrize(
     ("version", "folder"),
     [("v1.0", "info_label"), ("v2.0", "info_label_v2"), ("v2.1", "info_label")],
@@ -143,12 +128,24 @@ def test_one_bad_member_leaves_the_others(tmp_path):
         KRadar(labels=path)
 
 
-def test_a_root_of_symbolic_links(kradar_root, tmp_path):
-    (tmp_path / "radar_grid.json").symlink_to(kradar_root / "radar_grid.json")
-    for sequence in "12":
-        (tmp_path / sequence).symlink_to(kradar_root / sequence)
-    assert [f.key for f in KRadar(tmp_path)] == [f.key for f in KRadar(kradar_root)]
-    assert KRadar(tmp_path)[0].tesseract_path is not None
+def test_links_other_spellings_and_an_archive_of_another_system(tmp_path, kradar_root):
+    root, links = tmp_path / "root", tmp_path / "links"
+    touch(root / "05/info_label/4_1.txt", HEADER)
+    touch(root / "split/train.txt", "05,4_1.txt")
+    links.mkdir()
+    (links / "05").symlink_to(root / "05")
+    for place, split in ((root, "train"), (links, None)):
+        assert [frame.key for frame in KRadar(place, split=split)] == ["5/00004_00001"]
+    assert list(folders.find_labels(links)) == [(5, LABEL)]
+    touch(root / f"05/info_label/{LABEL}.txt", HEADER)
+    with pytest.raises(DataError, match=rf"frame 5/{LABEL} is there twice, as"):
+        KRadar(root)
+    path = tmp_path / "labels.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(f"labels\\7\\{LABEL}.txt", HEADER)
+        archive.writestr(f"__MACOSX/labels/7/._{LABEL}.txt", "x")
+        archive.writestr("labels/7/.DS_Store", "x")
+    assert [frame.key for frame in KRadar(labels=path)] == [f"7/{LABEL}"]
 
 
 # Files of a whole dataset ----------------------------------------------------------
@@ -302,30 +299,3 @@ def test_missing_files_have_defaults_and_are_counted(tmp_path):
     data = KRadar(labels=tmp_path)
     assert not data.summary().problems
     assert data.counts["sequences with the default calibration"] == 1
-
-
-def test_other_spellings_of_the_same_frames(tmp_path):
-    touch(tmp_path / "root/05/info_label/4_1.txt", HEADER)
-    touch(tmp_path / "root/split/train.txt", "05,4_1.txt")
-    data = KRadar(tmp_path / "root", split="train")
-    assert [frame.key for frame in data] == ["5/00004_00001"]
-    touch(tmp_path / f"root/05/info_label/{LABEL}.txt", HEADER)
-    with pytest.raises(DataError, match=rf"frame 5/{LABEL} is there twice, as"):
-        KRadar(tmp_path / "root")
-
-
-def test_an_archive_of_another_system(tmp_path):
-    path = tmp_path / "labels.zip"
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr(f"labels\\7\\{LABEL}.txt", HEADER)
-        archive.writestr(f"__MACOSX/labels/7/._{LABEL}.txt", "x")
-        archive.writestr("labels/7/.DS_Store", "x")
-    (frame,) = KRadar(labels=path)
-    assert frame.key == f"7/{LABEL}"
-
-
-def test_a_revision_of_links(tmp_path):
-    touch(tmp_path / f"disk/7/{LABEL}.txt", HEADER)
-    (tmp_path / "labels").mkdir()
-    (tmp_path / "labels/7").symlink_to(tmp_path / "disk/7")
-    assert list(folders.find_labels(tmp_path / "labels")) == [(7, LABEL)]
