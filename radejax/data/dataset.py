@@ -189,8 +189,10 @@ class LabelledFrames(Sequence[_F]):
         *,
         is_simulated: bool = False,
     ) -> None:
-        self.grid, self.is_simulated = grid, is_simulated
-        self._frames, self._summary = frames, summary or Summary()
+        self.grid = grid
+        self.is_simulated = is_simulated
+        self._frames = frames
+        self._summary = summary or Summary()
 
     @classmethod
     def from_options(cls, options: DataOptions, classes: Sequence[str]) -> Self:
@@ -233,7 +235,8 @@ class LabelledFrames(Sequence[_F]):
     def _with(self, frames: Sequence[_F], summary: Summary) -> Self:
         """Returns the dataset with other frames."""
         other = copy.copy(self)
-        other._frames, other._summary = frames, summary
+        other._frames = frames
+        other._summary = summary
         return other
 
     def without(self, left_out: Collection[str], reason: str) -> Self:

@@ -64,7 +64,8 @@ def frame_histories(keys: Iterable[str], num_frames: int) -> dict[str, tuple[str
                 "with the number of the frame in its sequence, such as 00033_00001"
             )
         numbered.append((sequence, int(number[0]), key))
-    histories, latest = {}, dict[tuple[str, int], tuple[str, ...]]()
+    histories = {}
+    latest = dict[tuple[str, int], tuple[str, ...]]()
     for sequence, index, key in sorted(numbered):
         before = latest.get((sequence, index - 1), (key,) * num_frames)
         histories[key] = latest[sequence, index] = (*before[1:], key)
@@ -265,7 +266,8 @@ def _make_order(
     index, count = options.process_index, options.process_count
     if index is None or count is None:
         index, count = jax.process_index(), jax.process_count()
-    rows, total = options.batch_size * count, num_frames
+    rows = options.batch_size * count
+    total = num_frames
     if options.pad_remainder:
         total = -(-num_frames // rows) * rows
     elif options.drop_remainder:
@@ -298,7 +300,8 @@ class _LoadBatch(grain.transforms.Map):
     def __init__(
         self, table: FrameTable, augment: Augmentation | None, num_threads: int
     ) -> None:
-        self._table, self._augment = table, augment
+        self._table = table
+        self._augment = augment
         self._map: Any = map
         if num_threads:
             self._map = concurrent.futures.ThreadPoolExecutor(num_threads).map
@@ -334,7 +337,8 @@ class _LoadBatch(grain.transforms.Map):
 
     def _sample(self, index: int) -> Sample:
         """Returns the sample of one frame."""
-        table, images = self._table, self._table.images
+        table = self._table
+        images = self._table.images
         projection = read_sample(table.records, table.keys[index])
         sample = Sample(projection, table.boxes[index], table.classes[index])
         if images is None:
@@ -345,7 +349,8 @@ class _LoadBatch(grain.transforms.Map):
 
     def _empty(self, size: int) -> Batch:
         """Returns a batch that contains only padding."""
-        records, images = self._table.records, self._table.images
+        records = self._table.records
+        images = self._table.images
         rows = (size, self._table.boxes.shape[1])
         *bins, channels = records.shape
         channels *= len(self._table.keys[0])

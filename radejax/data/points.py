@@ -64,7 +64,8 @@ def cfar_points(
     r, a = np.nonzero(power_db - mean_db > threshold_db)
     order = np.argsort(-power_db[r, a], kind="stable")
     r, a = r[order], a[order]
-    azimuth_rad, e = grid.azimuth_rad[a], np.zeros_like(r)
+    azimuth_rad = grid.azimuth_rad[a]
+    e = np.zeros_like(r)
     elevation_rad, doppler_mps = np.zeros(r.size), np.full(r.size, np.nan)
     if grid.num_elevation:
         e = elevation[r, a].argmax(-1)

@@ -128,7 +128,8 @@ def _column_maxima(column: Real[np.ndarray, "E R D"]) -> Real[np.ndarray, "R D+E
     elevation, range_, doppler = column.shape
     maxima = np.empty((range_, doppler + elevation), column.dtype)
     # For many short contiguous rows reduceat has a fraction of reduce's overhead.
-    rows, starts = column.reshape(elevation, -1), np.arange(range_) * doppler
+    rows = column.reshape(elevation, -1)
+    starts = np.arange(range_) * doppler
     np.maximum.reduceat(rows, starts, axis=1, out=maxima[:, doppler:].T)
     # Reversed order, because the elevations that were read last are still in the cache.
     maxima[:, :doppler] = column[::-1].max(axis=0)

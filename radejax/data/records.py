@@ -331,7 +331,8 @@ def preprocess(
     if frames.release is not None:
         source["release"] = frames.release
     records = Records.create(folder, grid.projection_shape, dtype, source)
-    keys, mine = records.keys(), list(frames)[index::count]
+    keys = records.keys()
+    mine = list(frames)[index::count]
     if frames.reader_version is not None:
         _warn_of_changes(records, [frame for frame in mine if frame.key in keys])
     missing = [frame for frame in mine if frame.key not in keys]
@@ -362,7 +363,8 @@ def _warn_of_changes(records: Records, frames: FrameSequence) -> None:
     """
 
     def is_changed(frame: LabelledFrame) -> bool:
-        file, stored = _file_of(frame), records.path(frame.key).with_suffix(".json")
+        file = _file_of(frame)
+        stored = records.path(frame.key).with_suffix(".json")
         return file is not None and files.read_json(stored) != file
 
     changed = [frame.key for frame in frames if is_changed(frame)]
@@ -371,7 +373,8 @@ def _warn_of_changes(records: Records, frames: FrameSequence) -> None:
         _log.warning(
             "the radar files of %d of them, such as that of frame %s, have changed: delete "
             "the folder to preprocess them again",
-            *(len(changed), changed[0]),
+            len(changed),
+            changed[0],
         )
     for frame in itertools.islice((f for f in frames if f.key not in changed), 1):
         now = encode(frame.read_projection(records.grid), records.dtype)

@@ -114,7 +114,8 @@ def check_dataset(
         DataError: The folders or the labels are ambiguous or corrupted as a whole.
     """
     data = KRadar(roots, **options)
-    summary, splits = data.summary(), _find_splits(data)
+    summary = data.summary()
+    splits = _find_splits(data)
     groups = itertools.groupby(data, key=lambda frame: frame.sequence)
     frames = {number: list(group) for number, group in groups}
     folders = dict(data.files.sequences)

@@ -77,7 +77,8 @@ def read_description(path: PathLike) -> Conditions:
 
 def check_weather(names: Iterable[str]) -> tuple[str, ...]:
     """Returns the names; raises a `UserError` if there are none or one is unknown."""
-    names, known = tuple(names), (*WEATHERS, "unknown")
+    names = tuple(names)
+    known = (*WEATHERS, "unknown")
     if not names or not set(names) <= set(known):
         raise UserError(f"unknown weather {names}; available: {', '.join(known)}")
     return names

@@ -219,7 +219,8 @@ def keys_of_split(index: Index, split: PathLike | None) -> tuple[list[Key], Summ
 
     They are those of a split in the chosen sequences.
     """
-    summary, numbers = Summary(), index.options.sequence_numbers
+    summary = Summary()
+    numbers = index.options.sequence_numbers
     labelled = {number for number, _ in index.label_paths}
     here = labelled & set(index.sequences) if index.sequences else labelled
     wanted = here if numbers is None else set(numbers)
@@ -230,7 +231,8 @@ def keys_of_split(index: Index, split: PathLike | None) -> tuple[list[Key], Summ
         )
     keys = [key for key in index.label_paths if key[0] in wanted]
     if numbers is None:
-        absent, rest = len(labelled - here), len(index.label_paths) - len(keys)
+        absent = len(labelled - here)
+        rest = len(index.label_paths) - len(keys)
         summary.counts["sequences with labels that are not in the roots"] = absent
         summary.counts["frames of sequences that are not in the roots"] = rest
     if split is None:
@@ -302,7 +304,8 @@ def read(index: Index, keys: Iterable[Key]) -> tuple[list[Frame], Summary]:
     Frames of other weathers than the wanted ones are left out. Missing or malformed files
     and lines are skipped and reported.
     """
-    summary, keys = Summary(), list(keys)
+    summary = Summary()
+    keys = list(keys)
     sequences = {
         number: _read_sequence(index, number, summary)
         for number in sorted({number for number, _ in keys})
@@ -332,10 +335,12 @@ class _Sequence(NamedTuple):
 def _read_sequence(index: Index, number: int, summary: Summary) -> _Sequence:
     """Reads the files of a sequence; missing ones have default values."""
     folder = index.sequences.get(number, folders.NO_FOLDER)
-    counts, options = summary.counts, index.options
+    counts = summary.counts
+    options = index.options
     places = folders.as_paths(options.camera_calibration)
     places += [root / name for root in index.roots for name in _CAMERA_FOLDERS]
-    camera, own = None, f"seq_{number:02d}/cam_1.yml"
+    camera = None
+    own = f"seq_{number:02d}/cam_1.yml"
     if not options.common_camera:
         camera = folders.first_file(places, [f"calib_seq_v2/{own}", own])
     if camera is None:
@@ -389,7 +394,9 @@ def _read_label_files(
     index: Index, keys: Iterable[Key], summary: Summary
 ) -> dict[Key, LabelFile]:
     """Reads label files; corrupted ones are left out and reported."""
-    files, counts, lines = {}, summary.counts, []
+    files = {}
+    counts = summary.counts
+    lines = []
     for key in keys:
         path = index.label_paths[key]
         file = _read_or_report(index.read_labels, path, "label file", summary)

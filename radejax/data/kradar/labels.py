@@ -50,7 +50,8 @@ _MAX_NUMBER = 1e4  # meters or degrees
 # Every pattern matches in linear time.
 _NUMBER = r"([+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?)"
 _SEPARATOR = r"\s*,\s*"
-_FLAG, _ID = r"(?P<visibility>[A-Za-z]\w*)", r"(?P<track_id>-?\d{1,9})"
+_FLAG = r"(?P<visibility>[A-Za-z]\w*)"
+_ID = r"(?P<track_id>-?\d{1,9})"
 _PREVIOUS_ID = r"-?\d{1,9}"  # identity in the previous frame, not used
 _CLASS = f"(?P<cls>{'|'.join(LABEL_CLASSES)})"
 _FIELDS = {

@@ -71,8 +71,10 @@ def write_points(path: PathLike, points: Float[np.ndarray, "N 11"]) -> None:
     - `.pcd`: binary point cloud of PCL with float32 fields.
     - `.bin`: little-endian float32 without a header, 11 per point.
     """
-    path, values = as_path(path), points.astype("<f4")
-    count, ones = len(POINT_FIELDS), len(POINT_FIELDS) * " 1"
+    path = as_path(path)
+    values = points.astype("<f4")
+    count = len(POINT_FIELDS)
+    ones = count * " 1"
     header = (
         f"# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\n"
         f"FIELDS {' '.join(POINT_FIELDS)}\nSIZE{count * ' 4'}\nTYPE{count * ' F'}\n"

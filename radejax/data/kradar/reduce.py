@@ -48,9 +48,12 @@ def reduce_dataset(
         DataError: The folders are ambiguous.
     """
     require(0 < rate < 1, "rate", rate, "a number above 0 and below 1")
-    began, out, paths = time.perf_counter(), as_path(out), list(map(as_path, roots))
+    began = time.perf_counter()
+    out = as_path(out)
+    paths = list(map(as_path, roots))
     require(out not in paths, "out", str(out), "another folder than the roots")
-    grid, targets = read_grid(paths), {}
+    grid = read_grid(paths)
+    targets = {}
     check_axes(grid)
     for folder in find_sequences(paths).values():
         for path in folder.listing("radar_tesseract").values():
@@ -64,7 +67,8 @@ def reduce_dataset(
         name = f"form of the radar data in {out}"
         require(form in (None, release), name, form, release)
     if release == "rpc" and (done := targets.keys() - set(missing)):
-        points, size = read_npy(targets[min(done)], mapped=True), polar_shape(grid)[1:]
+        points = read_npy(targets[min(done)], mapped=True)
+        size = polar_shape(grid)[1:]
         found = len(points) / math.prod(size)
         is_same = abs(found - rate) < 0.1 * rate + 2 / math.prod(size)
         require(is_same, "rate", rate, f"about {found:.3g}, as of the points in {out}")
@@ -82,7 +86,8 @@ def reduce_dataset(
             frame = strongest_points(frame, grid, rate, is_axis_up=is_axis_up)
         with atomic_write(targets[path]) as file:
             np.save(file, frame)
-    num_found, seconds = len(targets) - len(missing), time.perf_counter() - began
+    num_found = len(targets) - len(missing)
+    seconds = time.perf_counter() - began
     return PreprocessReport(len(targets), num_found, skipped, seconds)
 
 

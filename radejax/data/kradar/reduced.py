@@ -127,10 +127,13 @@ def project_reduced(
     if frame.ndim == 2:
         bins: Any = _bins_of_points(frame, grid, name)
         beams = bins[0][None] * grid.num_azimuth + bins[1]
-        cells, rows = frame.T[3:5, None], grid.num_range
+        cells = frame.T[3:5, None]
+        rows = grid.num_range
     else:
         # So few rows at a time stay in the cache.
-        bins, cells, rows = ..., frame, 16
+        bins = ...
+        cells = frame
+        rows = 16
         beams = np.arange(rows * grid.num_azimuth).reshape(rows, -1, 1)
     _check_power(cells[0], name)
     if grid.num_doppler:
@@ -165,9 +168,10 @@ def reduce_tensor(tesseract: Real[np.ndarray, "D R E A"], grid: RadarGrid) -> Po
     The steps have the precision of K-Radar's: that of the tensor, and float64 from the
     product with the Doppler axis on. Cells without power have a mean Doppler of NaN.
     """
-    weights, exact = grid.doppler_mps, _KRADAR_DOPPLER_MPS
-    if weights.shape == exact.shape and np.allclose(weights, exact, atol=1e-6):
-        weights = exact
+    weights = grid.doppler_mps
+    is_kradar = weights.shape == _KRADAR_DOPPLER_MPS.shape
+    if is_kradar and np.allclose(weights, _KRADAR_DOPPLER_MPS, atol=1e-6):
+        weights = _KRADAR_DOPPLER_MPS
     weights = weights[1:, None, None]
     polar = np.empty(polar_shape(grid))
     for azimuth in range(grid.num_azimuth):
@@ -214,7 +218,8 @@ def to_polar(frame: Real[np.ndarray, "..."], grid: RadarGrid, name: str) -> Pola
     project_reduced(frame, grid, name)  # checks the values
     if frame.ndim > 2:
         return frame
-    frame, polar = _with_direction(frame), np.zeros(polar_shape(grid))
+    frame = _with_direction(frame)
+    polar = np.zeros(polar_shape(grid))
     r, a, e = _bins_of_points(frame, grid, name)
     polar[:, r, a, e] = frame[:, 3:5].T
     return polar

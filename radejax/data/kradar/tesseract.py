@@ -79,7 +79,8 @@ def project_file(
             projection = project_columns(_read_columns(file, layout), layout.shape)
         else:
             tensor = _read_array(file, layout)
-            lowest, projection = float(tensor[..., 0].min()), project_tensor(tensor)
+            lowest = float(tensor[..., 0].min())
+            projection = project_tensor(tensor)
     _check_power(path, projection[..., layout.shape[0] :], lowest)
     return projection
 
@@ -243,7 +244,8 @@ def _opened(
         open(as_path(path), "rb", buffering=0) as file,
     ):
         layout = _find_array(file)
-        shape, axes = layout.shape, "(Doppler, range, elevation, azimuth)"
+        shape = layout.shape
+        axes = "(Doppler, range, elevation, azimuth)"
         if len(shape) != 4 or shape != tuple(shape_drea or shape):
             raise DataError(
                 f"{path}: {VARIABLE} has shape {shape}, expected "
@@ -312,7 +314,8 @@ def _find_array(file: BinaryIO) -> Layout:
     if header[124:] != b"\0\1IM":  # version and little-endian byte order
         hint = "; save it in v7 or v6" if header.startswith(b"MATLAB 7.3") else ""
         raise DataError(f"{file.name}: not a MATLAB v5 file{hint}")
-    names, start = [], 128
+    names = []
+    start = 128
     while start + 8 <= size:
         file.seek(start)
         kind, num_bytes = struct.unpack("<II", file.read(8))
@@ -354,7 +357,8 @@ def _read_array(file: BinaryIO, layout: Layout) -> np.ndarray:
         start, size = layout.deflated
         file.seek(start)
         inflater = zlib.decompressobj()
-        content, filled = bytearray(layout.num_bytes), 0
+        content = bytearray(layout.num_bytes)
+        filled = 0
         for begin in range(0, size, _CHUNK):
             part = inflater.decompress(file.read(min(_CHUNK, size - begin)))
             content[filled : filled + len(part)] = part
