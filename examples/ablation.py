@@ -346,8 +346,8 @@ class Comparer:
         index = (*CLASSES, "mean").index(cls)
         ap_a, ap_b = (self.aps(n, seeds, condition)[..., index] for n in (a, b))
         count = int(self.samples(a, seeds[0])[f"{_SEQUENCES}{condition}"])
-        _, _, gap, _, low, high, _ = difference(ap_b, ap_a, True, count)
-        return {"difference": gap, "low": low, "high": high}
+        found = difference(ap_b, ap_a, True, count)
+        return {"difference": found.difference, "low": found.low, "high": found.high}
 
     def claims(self) -> Iterator[dict[str, Any]]:
         """Yields the study's claims with difference, interval and verdict."""

@@ -29,22 +29,6 @@ Masks = dict[str, tuple[Bool[np.ndarray, " N"], Bool[np.ndarray, " M"]]]
 """Masks `[N]` of the objects and `[M]` of the predictions by the name of the subset."""
 
 
-def matched_objects(
-    data: EvaluationSet, space: str, iou: float
-) -> Int[np.ndarray, " M"]:
-    """Returns the object that each prediction matches in `all_point`, or -1.
-
-    Examples:
-        >>> car = {"frame": [0], "box": [[20.0, 0, 0, 4, 2, 1.5, 0]], "cls": ["Sedan"]}
-        >>> data = EvaluationSet(car, {**car, "score": [0.9]}, classes=["Sedan"])
-        >>> matched_objects(data, "bev", 0.5).tolist()
-        [0]
-    """
-    match = data.match("plain", "free", space, iou)
-    assert isinstance(match, np.ndarray)  # only K-Radar's rule gives another type
-    return match
-
-
 def subsets(
     data: EvaluationSet, frames: Columns, iou: float
 ) -> dict[str, list[dict[str, Any]]]:
@@ -67,7 +51,7 @@ def subsets(
         >>> subsets(data, {"frame": [0], "weather": ["fog"]}, 0.5)["weather"][0]["ap"]
         100.0
     """
-    match = matched_objects(data, "3d", iou)
+    match = data.matched_objects("plain", "free", "3d", iou)
     kinds = {"distance": _by_distance(data, match)}
     for kind in ("weather", "environment", "time"):
         kinds[kind] = {
@@ -110,7 +94,7 @@ def distance_sets(data: EvaluationSet, iou: float) -> dict[str, EvaluationSet]:
         >>> len(distance_sets(data, 0.5)["20-40 m"].gt)
         1
     """
-    bands = _by_distance(data, matched_objects(data, "3d", iou))
+    bands = _by_distance(data, data.matched_objects("plain", "free", "3d", iou))
     return {name: data.of_boxes(*both, data.frame) for name, both in bands.items()}
 
 
@@ -122,8 +106,7 @@ def _numbers(
     match: Int[np.ndarray, " M"],
 ) -> dict[str, float]:
     """Computes AP, precision, recall and counts of one class in one subset."""
-    order = data.by_score[cls]
-    order = order[in_pred[order]]
+    order = data.by_score[(in_pred & (data.pred.cls == cls))[data.by_score]]
     score, is_tp = data.score[order], match[order] >= 0
     num_gt = int((in_gt & (data.gt.cls == cls)).sum())
     curve = pooled_curve(score, is_tp, np.ones_like(order), num_gt, "all_point")
@@ -156,7 +139,7 @@ def box_errors(data: EvaluationSet, iou: float) -> dict[str, dict[str, float]]:
         >>> box_errors(data, 0.5)["Sedan"]["center_m_mean"]
         0.0
     """
-    match = matched_objects(data, "bev", iou)
+    match = data.matched_objects("plain", "free", "bev", iou)
     rows = np.flatnonzero((match >= 0) & (data.score > 0))
     found, truth = data.pred.box[rows], data.gt.box[match[rows]]
     turn = np.abs(np.angle(np.exp(1j * (found[:, 6] - truth[:, 6]))))
@@ -206,7 +189,7 @@ def worst_frames(
         >>> worst_frames(data, {}, 0.5)
         []
     """
-    match = matched_objects(data, "3d", iou)
+    match = data.matched_objects("plain", "free", "3d", iou)
     above = data.score > OPERATING_SCORE
     num = data.frame.size
     found = np.bincount(data.pred.frame[above & (match >= 0)], minlength=num)

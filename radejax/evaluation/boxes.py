@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Int, Real, Shaped
 from numpy.typing import ArrayLike
 
-from radejax.core.errors import DataError, UserError
+from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import PathLike, atomic_write
 from radejax.core.structures import BOX_FIELDS, CLASSES, ROIS, Boxes, frame_key
 
@@ -25,6 +25,9 @@ Columns = Mapping[str, np.ndarray]
 
 AnyColumns = Mapping[str, ArrayLike]
 """A table as users pass it: lists are accepted as columns."""
+
+AnyBoxes = AnyColumns | Boxes
+"""Ground truth or predictions as users pass them."""
 
 Roi = str | Sequence[float] | None
 """A region of interest: "narrow", "wide", (x0, x1, y0, y1, z0, z1), or None for all."""
@@ -43,14 +46,11 @@ def roi_bounds(roi: Roi) -> tuple[float, ...] | None:
     if roi is None:
         return None
     if isinstance(roi, str):
-        if roi not in ROIS:
-            raise UserError(f"roi is {roi!r}, expected one of {', '.join(ROIS)}")
+        require(roi in ROIS, "roi", roi, f"one of {', '.join(ROIS)}")
         return ROIS[roi]
     bounds = np.asarray(roi, np.float64).reshape(-1)
-    if bounds.size != 6 or not np.all(bounds[::2] < bounds[1::2]):
-        raise UserError(
-            f"roi is {roi}, expected x0, x1, y0, y1, z0, z1 with increasing bounds"
-        )
+    is_valid = bounds.size == 6 and bool((bounds[::2] < bounds[1::2]).all())
+    require(is_valid, "roi", roi, "x0, x1, y0, y1, z0, z1 with increasing bounds")
     return tuple(bounds.tolist())
 
 
@@ -83,11 +83,23 @@ def roi_name(roi: Roi) -> str:
     return names.get(bounds) or ",".join(f"{value:g}" for value in bounds)
 
 
-def read_boxes(table: AnyColumns | Boxes, name: str, *, scored: bool) -> Boxes:
+def columns_of_boxes(table: AnyBoxes) -> Columns:
+    """Returns boxes as columns; boxes without scores have no column score.
+
+    Examples:
+        >>> box = Boxes(np.array([7]), np.ones((1, 7)), np.array(["Sedan"]))
+        >>> list(columns_of_boxes(box))
+        ['frame', 'box', 'cls']
+    """
+    columns = vars(table) if isinstance(table, Boxes) else table
+    return {name: np.asarray(x) for name, x in columns.items() if x is not None}
+
+
+def read_boxes(table: AnyBoxes, name: str, *, scored: bool) -> Boxes:
     """Reads boxes from the columns frame, box, cls and, for predictions, score.
 
     Args:
-        table: Columns by name.
+        table: Boxes, or columns by name.
         name: Name of the table in errors, such as "predictions".
         scored: Whether a score is expected.
 
@@ -100,30 +112,43 @@ def read_boxes(table: AnyColumns | Boxes, name: str, *, scored: bool) -> Boxes:
         >>> read_boxes(table, "ground truth", scored=False).cls.tolist()
         ['Sedan']
     """
-    if isinstance(table, Boxes):
-        boxes = table
-    else:
-        wanted = ("frame", "box", "cls", "score")[: 4 if scored else 3]
-        if missing := [column for column in wanted if column not in table]:
-            raise UserError(f"{name} lack the columns {missing}; found {sorted(table)}")
-        frame = _frame_column(table, name)
-        box = np.asarray(table["box"], np.float64)
-        box = box if frame.size else np.zeros((0, 7))  # an empty list has no width
-        cls = np.asarray(table["cls"]).astype(str)
-        score = np.asarray(table["score"], np.float64) if scored else None
-        try:
-            boxes = Boxes(frame, box, cls, score)
-        except DataError as error:
-            raise DataError(f"{name}: {error}") from None
+    columns = columns_of_boxes(table)
+    if missing := [x for x in column_names(scored) if x not in columns]:
+        raise UserError(f"{name} lack the columns {missing}; found {sorted(columns)}")
+    frame = _frame_column(columns, name)
+    box = columns["box"].astype(np.float64)
+    box = box if frame.size else np.zeros((0, 7))  # an empty list has no width
+    score = columns["score"].astype(np.float64) if scored else None
+    try:
+        return Boxes(frame, box, columns["cls"].astype(str), score)
+    except DataError as error:
+        raise DataError(f"{name}: {error}") from None
+
+
+def column_names(scored: bool) -> tuple[str, ...]:
+    """Returns the columns of ground truth, or of predictions with scores.
+
+    Examples:
+        >>> column_names(scored=False)
+        ('frame', 'box', 'cls')
+    """
+    return ("frame", "box", "cls", "score")[: 4 if scored else 3]
+
+
+def require_sizes(boxes: Boxes, name: str) -> None:
+    """Raises a `DataError` for boxes with a size that is not positive.
+
+    Examples:
+        >>> require_sizes(Boxes.one_frame(np.ones(7), ["Sedan"]), "ground truth")
+    """
     is_empty = boxes.box[:, 3:6] <= 0
     if is_empty.any():
         row, size = np.argwhere(is_empty)[0]
-        hint = " (or --invalid-sizes false_positive)" if scored else ""
+        hint = "" if boxes.score is None else " (or --invalid-sizes false_positive)"
         raise DataError(
             f"{name}: frame {boxes.frame[row]}, row {row}: {BOX_FIELDS[3 + size]} of the "
             f"box is {boxes.box[row, 3 + size]:g} m, expected a size above 0{hint}"
         )
-    return boxes
 
 
 def _frame_column(table: AnyColumns, name: str) -> Int[np.ndarray, " N"]:
@@ -240,7 +265,7 @@ def columns_of(
 
 def tables_from_frames(
     frames: Iterable[Any], split: str | None = None
-) -> tuple[Columns, Columns]:
+) -> tuple[Boxes, Columns]:
     """Builds ground truth and frame table of a dataset such as `radejax.data.kradar.KRadar`.
 
     Args:
@@ -250,24 +275,23 @@ def tables_from_frames(
             None if it is not known.
 
     Returns:
-        The ground-truth columns and the frame columns. The frame id is the position in
-        `frames`.
+        The ground truth and the frame columns. The frame id is the position in `frames`.
 
     Examples:
         >>> truth, frames = tables_from_frames([], "test")
-        >>> truth["box"].shape, frames["split"].size
-        ((0, 7), 0)
+        >>> len(truth), frames["split"].size
+        (0, 0)
     """
     frames = list(frames)
-    counts = [len(frame.boxes) for frame in frames]
+    ids = np.arange(len(frames))
     box = [np.asarray(frame.boxes, np.float64).reshape(-1, 7) for frame in frames]
     cls = [str(name) for frame in frames for name in frame.classes]
-    ground_truth = {
-        "frame": np.repeat(np.arange(len(frames)), counts),
-        "box": np.concatenate(box) if box else np.zeros((0, 7)),
-        "cls": np.array(cls, dtype=str),
-    }
-    table = {"frame": np.arange(len(frames))}
+    ground_truth = Boxes(
+        np.repeat(ids, np.array([len(rows) for rows in box], int)),
+        np.concatenate([np.zeros((0, 7)), *box]),
+        np.array(cls, dtype=str),
+    )
+    table = {"frame": ids}
     for column in ("sequence", "name", "weather", "environment", "time"):
         table[column] = np.array([getattr(frame, column) for frame in frames])
     table["simulated"] = np.array([frame.is_simulated for frame in frames], bool)
@@ -276,7 +300,7 @@ def tables_from_frames(
     return ground_truth, table
 
 
-def write_boxes(path: PathLike, boxes: Boxes, frames: Columns) -> None:
+def write_boxes(path: PathLike, boxes: Boxes, frames: AnyColumns) -> None:
     """Writes boxes as columns to a .npz file, which `files.read_table` reads.
 
     Frames are written by key if the frame table has names, and by id otherwise. Keys
@@ -291,7 +315,7 @@ def write_boxes(path: PathLike, boxes: Boxes, frames: Columns) -> None:
         ...     np.load(path)["frame"].tolist()
         ['1/00033_00001']
     """
-    columns = {k: v for k, v in vars(boxes).items() if v is not None}
+    columns: dict[str, Any] = {**columns_of_boxes(boxes)}
     if "name" in frames:
         position = frame_positions(boxes.frame, frame_ids(frames), str(path))
         columns["frame"] = np.array(frame_keys(frames), dtype=str)[position]
@@ -302,7 +326,7 @@ def write_boxes(path: PathLike, boxes: Boxes, frames: Columns) -> None:
 # Frames by name -----------------------------------------------------------------------
 
 
-def frame_keys(frames: Columns) -> list[str]:
+def frame_keys(frames: AnyColumns) -> list[str]:
     """Returns the key "sequence/name" of every frame, or its name or id if that is missing.
 
     Examples:
@@ -310,16 +334,16 @@ def frame_keys(frames: Columns) -> list[str]:
         ['5/00012_00001']
     """
     if "name" not in frames:
-        return [str(frame) for frame in frames["frame"]]
-    names = [str(name).removesuffix(".txt") for name in frames["name"]]
+        return [str(frame) for frame in np.asarray(frames["frame"])]
+    names = [str(name).removesuffix(".txt") for name in np.asarray(frames["name"])]
     if "sequence" not in frames:
         return names
-    pairs = zip(frames["sequence"], names, strict=True)
+    pairs = zip(np.asarray(frames["sequence"]), names, strict=True)
     return [name if "/" in name else f"{number}/{name}" for number, name in pairs]
 
 
 def with_ids(
-    table: Columns, frames: Columns | None, where: str, *, skip: bool = False
+    table: Columns, frames: AnyColumns | None, where: str, *, skip: bool = False
 ) -> Columns:
     """Replaces the frame names of a table (keys or "sequence/radar") by frame ids.
 

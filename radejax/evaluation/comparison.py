@@ -17,9 +17,10 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 import pathlib
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -53,6 +54,18 @@ Aps = Float[np.ndarray, "_ _"]
 
 Run = Mapping[str, EvaluationSet]
 """Evaluation sets of the trainings of a run by the names of their seeds."""
+
+
+class Difference(NamedTuple):
+    """Fields of `Comparison` that are computed from the APs of two runs."""
+
+    ap_a: float
+    ap_b: float
+    difference: float
+    std: float = math.nan
+    low: float = math.nan
+    high: float = math.nan
+    p_value: float = math.nan
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,39 +143,58 @@ def compare(
     sets = [*run_a.values(), *run_b.values()]
     for other in sets[1:]:
         _check_same_truth(sets[0], other)
-    iou, sequence = options.iou_thresholds[0], np.asarray(frames["sequence"])
-    parts = [("all", "all", sets, sequence)]
+    rows = []
+    iou = options.iou_thresholds[0]
+    for kind, condition, chosen, sequence in _parts(sets, frames, iou):
+        names = options.main_protocols[:2] if kind == "all" else [protocols.RECOMMENDED]
+        num_sequences = np.unique(sequence).size
+        # The first row counts every frame once, which gives the APs over all frames.
+        weights = np.ones((1, sequence.size), np.int16)
+        if kind == "all" or num_sequences > 1:
+            drawn = sequence_weights(sequence, resamples=options.bootstrap)
+            weights = np.concatenate([weights, drawn])
+        is_single = in_one_sequence(chosen[0], sequence)
+        for protocol, space in itertools.product(names, spaces):
+            terms = options.settings_of(protocol)
+            aps = np.stack(
+                [resample(x, weights, protocol, space, iou, **terms) for x in chosen]
+            )
+            aps[:, 1:, is_single] = np.nan
+            for index, cls in enumerate((*sets[0].classes, "mean")):
+                a, b = np.split(aps[..., index], [len(run_a)])
+                # With a single class, the mean would be the same row again.
+                if np.isnan(a[0, 0]) or (cls == "mean" and index == 1):
+                    continue
+                is_paired = list(run_a) == list(run_b)
+                gap = difference(a, b, is_paired, num_sequences)
+                score = terms["score_threshold"]
+                rows.append(
+                    Comparison(kind, condition, cls, space, iou, protocol, score, *gap)
+                )
+    return _adjusted(rows, min(len(run_a), len(run_b)) >= MIN_SEEDS)
+
+
+def _parts(
+    sets: Sequence[EvaluationSet], frames: Columns, iou: float
+) -> Iterator[tuple[str, str, list[EvaluationSet], np.ndarray]]:
+    """Yields kind, condition, evaluation sets and the sequence of every frame."""
+    sequence = np.asarray(frames["sequence"])
+    yield "all", "all", list(sets), sequence
     for name, mask in condition_masks(frames, "weather").items():
-        chosen = [data.of_frames(mask) for data in sets]
-        parts.append(("weather", name, chosen, sequence[mask]))
+        yield "weather", name, [x.of_frames(mask) for x in sets], sequence[mask]
     bands = [distance_sets(data, iou) for data in sets]
     for name in bands[0]:
-        parts.append(("distance", name, [band[name] for band in bands], sequence))
-    classes, is_paired, rows = sets[0].classes, [*run_a] == [*run_b], []
-    for kind, condition, chosen, of_frame in parts:
-        names = options.main_protocols[:2] if kind == "all" else [protocols.RECOMMENDED]
-        # The first row counts every frame once, which gives the APs over all frames.
-        weights = np.ones((1, of_frame.size), np.int16)
-        if kind == "all" or np.unique(of_frame).size > 1:
-            drawn = sequence_weights(of_frame, resamples=options.bootstrap)
-            weights = np.concatenate([weights, drawn])
-        for protocol, space in itertools.product(names, spaces):
-            metric, terms = (protocol, space, iou), options.settings_of(protocol)
-            aps = np.stack([resample(x, weights, *metric, **terms) for x in chosen])
-            aps[:, 1:, in_one_sequence(chosen[0], of_frame)] = np.nan
-            shown = space, iou, protocol, terms["score_threshold"]
-            # With a single class, the mean would be the same row again.
-            for index, cls in enumerate((*classes, "mean")[: len(classes) ** 2]):
-                a, b = np.split(aps[..., index], [len(run_a)])
-                if not np.isnan(a[0, 0]):
-                    values = difference(a, b, is_paired, np.unique(of_frame).size)
-                    rows.append(Comparison(kind, condition, cls, *shown, *values))
-    is_tested = min(len(run_a), len(run_b)) >= MIN_SEEDS
-    adjusted, least = list[Comparison](), 0.0
-    for _, of_kind in itertools.groupby(rows, lambda row: row.kind):
+        yield "distance", name, [band[name] for band in bands], sequence
+
+
+def _adjusted(rows: Iterable[Comparison], is_tested: bool) -> list[Comparison]:
+    """Returns the rows with p-values after Holm's correction and, if tested, verdicts."""
+    adjusted = list[Comparison]()
+    least = 0.0
+    for kind, of_kind in itertools.groupby(rows, lambda row: row.kind):
         group = list(of_kind)
         found = np.maximum(_holm([row.p_value for row in group]), least).tolist()
-        if group[0].kind == "all":
+        if kind == "all":
             least = min((p for p in found if not np.isnan(p)), default=1.0)
         for row, p in zip(group, found, strict=True):
             verdict = p < 1 - LEVEL if is_tested and not np.isnan(p) else None
@@ -171,7 +203,7 @@ def compare(
     return adjusted
 
 
-def difference(a: Aps, b: Aps, is_paired: bool, num_sequences: int) -> tuple[Any, ...]:
+def difference(a: Aps, b: Aps, is_paired: bool, num_sequences: int) -> Difference:
     """Computes both APs, their difference, its deviation, interval and p-value.
 
     With `MIN_SEEDS` seeds or more of both runs, the interval counts the variance between
@@ -183,20 +215,19 @@ def difference(a: Aps, b: Aps, is_paired: bool, num_sequences: int) -> tuple[Any
         b: `[M, 1+B]` APs of run B in the same way.
         is_paired: Whether row i of both runs has the same seed.
         num_sequences: Number of sequences.
-
-    Returns:
-        The fields of `Comparison` from `ap_a` to `p_value`.
     """
     gaps = b.mean(axis=0) - a.mean(axis=0)
-    aps = float(a[:, 0].mean()), float(b[:, 0].mean()), float(gaps[0])
-    gaps, count = gaps[1:][~np.isnan(gaps[1:])], min(len(a), len(b))
+    aps = Difference(float(a[:, 0].mean()), float(b[:, 0].mean()), float(gaps[0]))
+    gaps = gaps[1:][~np.isnan(gaps[1:])]
+    count = min(len(a), len(b))
     if not gaps.size:
-        return *aps, *np.full(4, np.nan).tolist()
+        return aps
     if count < MIN_SEEDS:
+        low, high = interval(gaps)
         # One is added so that no finite number of resamples gives a p-value of 0.
         turned = min((gaps <= 0).sum(), (gaps >= 0).sum()) + 1
         p_value = float(min(1.0, 2 * turned / (gaps.size + 1)))
-        return *aps, float("nan"), *interval(gaps), p_value
+        return aps._replace(low=low, high=high, p_value=p_value)
     if is_paired:
         of_seeds = (b - a)[:, 0].var(ddof=1) / count
     else:
@@ -209,9 +240,13 @@ def difference(a: Aps, b: Aps, is_paired: bool, num_sequences: int) -> tuple[Any
     quotients = share * stdtrit(count - 1, 1 - p_values / 2)
     quotients += (1 - share) * stdtrit(num_sequences - 1, 1 - p_values / 2)
     half = error * np.interp(1 - LEVEL, p_values[::-1], quotients[::-1])
-    p_value = np.interp(abs(aps[2]) / error, quotients, p_values)
-    values = np.sqrt(count * of_seeds), aps[2] - half, aps[2] + half, p_value
-    return *aps, *map(float, values)
+    p_value = np.interp(abs(aps.difference) / error, quotients, p_values)
+    return aps._replace(
+        std=float(np.sqrt(count * of_seeds)),
+        low=float(aps.difference - half),
+        high=float(aps.difference + half),
+        p_value=float(p_value),
+    )
 
 
 def _holm(p_values: Sequence[float]) -> list[float]:

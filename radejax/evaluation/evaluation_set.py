@@ -5,17 +5,18 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
+from numpy.typing import ArrayLike
 
-from radejax.core.errors import DataError, UserError
+from radejax.core.errors import DataError, require
 from radejax.core.structures import CLASSES, Boxes
 from radejax.evaluation import boxes, matching, protocols
-from radejax.evaluation.boxes import AnyColumns, Roi
-from radejax.evaluation.protocols import Curve
+from radejax.evaluation.boxes import AnyBoxes, AnyColumns, Roi
+from radejax.evaluation.protocols import Curve, Protocol
 from radejax.geometry.rotated_iou import bev_intersection, shared_height
 
 T = TypeVar("T")
@@ -30,7 +31,26 @@ A frame rarely has more than 100 predictions and 20 objects of a class."""
 Rows = Bool[np.ndarray, " _"] | slice
 ALL = slice(None)
 
-Matches = matching.KradarMatches | Int[np.ndarray, " M"]
+
+class Ranking(NamedTuple):
+    """Predictions of one class above a score threshold, by descending score.
+
+    Attributes:
+        score: `[K]` scores.
+        frame: `[K]` positions of the frames.
+        value: `[K]` what each prediction adds to a sum over the predictions, such as
+            whether it is a true positive.
+    """
+
+    score: Float[np.ndarray, " K"]
+    frame: Int[np.ndarray, " K"]
+    value: Shaped[np.ndarray, " K"]
+
+    def weighted(
+        self, weight: Int[np.ndarray, " F"]
+    ) -> tuple[Float[np.ndarray, " K"], Int[np.ndarray, " K"]]:
+        """Returns the scores, and the values times the weights of their frames."""
+        return self.score, self.value * weight[self.frame]
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -104,6 +124,19 @@ def mean_ap(results: Sequence[Curve]) -> float:
     return float(np.mean(present)) if present else float("nan")
 
 
+def _cached(method: Callable[..., T]) -> Callable[..., T]:
+    """Makes a method of `EvaluationSet` compute its result once for equal arguments."""
+
+    @functools.wraps(method)
+    def cached(self: EvaluationSet, *args: str | float) -> T:
+        key = (method, *args)
+        if key not in self._cache:
+            self._cache[key] = method(self, *args)
+        return self._cache[key]
+
+    return cached
+
+
 class EvaluationSet:
     """Ground truth and predictions that are checked, sorted and paired once.
 
@@ -124,8 +157,8 @@ class EvaluationSet:
 
     def __init__(
         self,
-        ground_truth: AnyColumns | Boxes,
-        predictions: AnyColumns | Boxes,
+        ground_truth: AnyBoxes,
+        predictions: AnyBoxes,
         *,
         classes: Sequence[str] = CLASSES,
         frames: AnyColumns | None = None,
@@ -134,13 +167,15 @@ class EvaluationSet:
     ) -> None:
         """Creates an evaluation set; see `evaluate` for the arguments."""
         self.classes = tuple(classes)
-        is_repeated = len(set(self.classes)) < len(self.classes)
-        if isinstance(classes, str) or not self.classes or is_repeated:
-            raise UserError(f"classes is {classes!r}, expected different class names")
+        is_unique = len(set(self.classes)) == len(self.classes) > 0
+        is_valid = is_unique and not isinstance(classes, str)
+        require(is_valid, "classes", classes, "different class names")
         self.roi = boxes.roi_name(roi)
         self.label_version = label_version
         truth = boxes.read_boxes(ground_truth, "ground truth", scored=False)
         found = boxes.read_boxes(predictions, "predictions", scored=True)
+        boxes.require_sizes(truth, "ground truth")
+        boxes.require_sizes(found, "predictions")
         self.ground_truth, self.predictions = truth, found
         if frames is None:
             frames = {"frame": np.union1d(truth.frame, found.frame)}
@@ -166,8 +201,8 @@ class EvaluationSet:
         self.pair_pred, self.pair_gt = matching.candidate_pairs(
             self.pred_group, self.gt_group, self.pred.box, self.gt.box
         )
-        # Cache of `_once`, which all protocols, thresholds and frame weights share.
-        self._shared: dict[tuple[Any, ...], Any] = {}
+        # All protocols, thresholds and frame weights share the results of `_cached` methods.
+        self._cache: dict[tuple[Any, ...], Any] = {}
 
     def _select(self, table: Boxes, name: str) -> tuple[Boxes, Int[np.ndarray, " N"]]:
         """Returns the sorted boxes of the classes in the region, and their rows.
@@ -213,19 +248,9 @@ class EvaluationSet:
 
     # Shared work ---------------------------------------------------------------------
 
-    def _once(self, function: Callable[..., T], *arguments: Any) -> T:
-        """Returns the result of a method, which is cached for equal arguments."""
-        key = (function.__name__, *arguments)
-        if key not in self._shared:
-            self._shared[key] = function(*arguments)
-        return self._shared[key]
-
-    def overlap(self, geometry: str, space: str) -> Float[np.ndarray, " P"]:
-        """Returns the IoU of the candidate pairs in the geometry of a protocol."""
-        return self._once(self._overlap, geometry)[SPACES.index(space)]
-
-    def _overlap(self, geometry: str) -> Float[np.ndarray, "2 P"]:
-        """Computes BEV and 3D IoU of the candidate pairs from the same intersections."""
+    @_cached
+    def overlaps(self, geometry: str) -> dict[str, Float[np.ndarray, " P"]]:
+        """Returns the IoU of the candidate pairs in the geometry of a protocol, by space."""
         truth, found = self.gt.box, self.pred.box
         if geometry != "plain":
             truth = np.round(truth, 2)
@@ -233,7 +258,7 @@ class EvaluationSet:
             swap = [0, 1, 2, 4, 3, 5, 6]
             truth, found = truth[:, swap], found[:, swap]
         z_center = 1.0 if geometry == "swapped_lw_z_top" else 0.5
-        values = np.zeros((2, self.pair_gt.size))
+        bev, volumetric = np.zeros((2, self.pair_gt.size))
         # The IoU of a pair needs about 32 temporary values.
         for rows in matching.chunks(np.full(self.pair_gt.size, 32)):
             a, b = found[self.pair_pred[rows]], truth[self.pair_gt[rows]]
@@ -241,38 +266,74 @@ class EvaluationSet:
             volume = area * shared_height(a, b, z_center)
             area_a, area_b = a[:, 3] * a[:, 4], b[:, 3] * b[:, 4]
             volumes = area_a * a[:, 5] + area_b * b[:, 5]
-            values[0, rows] = area / (area_a + area_b - area)
-            values[1, rows] = volume / (volumes - volume)
-        if geometry == "plain":
-            return values
-        # K-Radar's code stores IoUs in single precision and compares them in double.
-        return values.astype(np.float32).astype(np.float64)
+            bev[rows] = area / (area_a + area_b - area)
+            volumetric[rows] = volume / (volumes - volume)
+        if geometry != "plain":
+            # K-Radar's code stores IoUs in single precision and compares them in double.
+            bev[:], volumetric[:] = (
+                bev.astype(np.float32),
+                volumetric.astype(np.float32),
+            )
+        return {"bev": bev, "3d": volumetric}
 
-    def match(self, geometry: str, rule: str, space: str, iou: float) -> Matches:
-        """Returns the matches of all frames and classes.
+    def _pairs(self, geometry: str, space: str) -> matching.Pairs:
+        iou = self.overlaps(geometry)[space]
+        return matching.Pairs(self.pair_pred, self.pair_gt, iou)
 
-        They are `KradarMatches` for the rule "kradar"; otherwise the matched object of
-        every prediction, or -1.
-        """
-        if geometry == "swapped_lw_z_top" and space == "bev":
-            geometry = "swapped_lw"  # z has no effect
-        return self._once(self._match, geometry, rule, space, iou)
-
-    def _match(self, geometry: str, rule: str, space: str, iou: float) -> Matches:
-        values = self.overlap(geometry, space)
-        pairs = matching.Pairs(self.pair_pred, self.pair_gt, values)
-        if rule == "kradar":
-            return matching.match_kradar(pairs, self.score, self.gt_group, iou)
+    @_cached
+    def matched_objects(
+        self, geometry: str, rule: str, space: str, iou: float
+    ) -> Int[np.ndarray, " M"]:
+        """Returns the object that each prediction matches by the rule "best" or "free", or -1."""
+        pairs = self._pairs(geometry, space)
         if rule == "best":
             return matching.match_best(pairs, self.score, iou)
         num_gt = len(self.gt)
         return matching.match_free(pairs, self.score, self.pred_group, num_gt, iou)
 
     @functools.cached_property
-    def by_score(self) -> list[Int[np.ndarray, " _"]]:
-        """Predictions of every class by descending score; ties are in input order."""
-        order = np.lexsort((self._pred_row, -self.score))
-        return [order[self.pred.cls[order] == c] for c in range(len(self.classes))]
+    def by_score(self) -> Int[np.ndarray, " M"]:
+        """Predictions by descending score; ties are in input order."""
+        return np.lexsort((self._pred_row, -self.score))
+
+    @_cached
+    def _pooled_rankings(
+        self, geometry: str, rule: str, space: str, iou: float, threshold: float
+    ) -> list[Ranking]:
+        """Returns the predictions of each class, which count if they match an object."""
+        is_tp = self.matched_objects(geometry, rule, space, iou) >= 0
+        # A threshold of 0 also keeps scores of 0.
+        return self._ranked(self.by_score, is_tp[self.by_score], threshold or -1.0)
+
+    @_cached
+    def _kradar_rankings(
+        self, geometry: str, space: str, iou: float, threshold: float
+    ) -> list[tuple[Ranking, Ranking, Ranking]]:
+        """Returns matches, changes of the true positives and predictions of each class."""
+        if geometry == "swapped_lw_z_top" and space == "bev":  # z has no effect
+            return self._kradar_rankings("swapped_lw", space, iou, threshold)
+        pairs = self._pairs(geometry, space)
+        found = matching.match_kradar(pairs, self.score, self.gt_group, iou)
+        matched = self._ranked(found.first_pred, 1, threshold)
+        events = self._ranked(found.event_pred, found.event_delta, threshold)
+        every = self._ranked(self.by_score, 1, threshold)
+        return list(zip(matched, events, every, strict=True))
+
+    def _ranked(
+        self, pred: Int[np.ndarray, " K"], value: ArrayLike, threshold: float
+    ) -> list[Ranking]:
+        """Returns the values of some predictions for each class, by descending score."""
+        order = np.argsort(-self.score[pred], kind="stable")
+        value = np.broadcast_to(value, pred.shape)[order]
+        pred = pred[order]
+        is_kept = self.score[pred] > threshold
+        rankings = []
+        for cls in range(len(self.classes)):
+            rows = is_kept & (self.pred.cls[pred] == cls)
+            mine = pred[rows]
+            ranking = Ranking(self.score[mine], self.pred.frame[mine], value[rows])
+            rankings.append(ranking)
+        return rankings
 
     # Results -------------------------------------------------------------------------
 
@@ -285,7 +346,6 @@ class EvaluationSet:
         score_threshold: float = 0.0,
         spaces: Sequence[str] = SPACES,
         weights: Shaped[np.ndarray, " F"] | None = None,
-        curves: bool = True,
         condition: str = "all",
     ) -> list[Result]:
         """Computes the results of one protocol over all frames or over weighted frames.
@@ -298,7 +358,6 @@ class EvaluationSet:
             spaces: See `evaluate`.
             weights: bool or int weight of every frame, such as the mask of a condition.
                 None counts every frame once.
-            curves: Whether to keep the precision, recall and score arrays.
             condition: Name of the condition that the weights select.
 
         Raises:
@@ -308,53 +367,55 @@ class EvaluationSet:
         chosen = protocols.get_protocol(protocol)
         empty_frames = chosen.resolve_empty_frames(empty_frames)
         spaces = (spaces,) if isinstance(spaces, str) else tuple(spaces)
-        if not set(spaces) <= set(SPACES):
-            raise UserError(f"spaces is {spaces}, expected some of {SPACES}")
+        require(set(spaces) <= set(SPACES), "spaces", spaces, f"some of {SPACES}")
         ious = np.atleast_1d(np.asarray(iou_thresholds, np.float64)).tolist()
-        if not ious or not all(0 <= iou < 1 for iou in ious):
-            raise UserError(
-                f"iou_thresholds is {iou_thresholds}, expected numbers in [0, 1)"
-            )
+        is_valid = bool(ious) and all(0 <= iou < 1 for iou in ious)
+        require(is_valid, "iou_thresholds", iou_thresholds, "numbers in [0, 1)")
+        score_threshold = float(score_threshold)
         frame_weights = self._frame_weights(empty_frames, weights)
-        points = () if curves else ("precision", "recall", "score")
-        dropped = dict.fromkeys(points, np.zeros(0))
         num_frames = (frame_weights > 0).sum(axis=0).tolist()
-        score_threshold, results = float(score_threshold), []
-        cases = itertools.product(spaces, ious, enumerate(self.classes))
-        for space, iou, (index, name) in cases:
-            # Protocols with the same geometry and matching share their rankings.
-            matched_by = chosen.geometry, chosen.matching, space, iou
-            ranked = self._once(self._ranking, matched_by, score_threshold, index)
-            weight = frame_weights[:, index]
-            num_gt = int(weight @ self.gt_count[:, index])
-            if chosen.matching == "kradar":
-                matched, events, detections = (
-                    (score, count * weight[frame]) for score, frame, count in ranked
+        results = []
+        for space, iou in itertools.product(spaces, ious):
+            curves = self._curves(chosen, space, iou, score_threshold, frame_weights)
+            for index, curve in enumerate(curves):
+                result = Result(
+                    cls=self.classes[index],
+                    space=space,
+                    iou=iou,
+                    protocol=chosen.name,
+                    num_frames=num_frames[index],
+                    score_threshold=score_threshold,
+                    empty_frames=empty_frames,
+                    roi=self.roi,
+                    label_version=self.label_version,
+                    is_simulated=self.is_simulated,
+                    condition=condition,
+                    **vars(curve),
                 )
-                curve = protocols.kradar_curve(
-                    matched, events, detections, num_gt, chosen.curve
-                )
-            else:
-                ((score, frame, is_tp),) = ranked
-                curve = protocols.pooled_curve(
-                    score, is_tp, weight[frame], num_gt, chosen.curve
-                )
-            result = Result(
-                cls=name,
-                space=space,
-                iou=iou,
-                protocol=chosen.name,
-                num_frames=num_frames[index],
-                score_threshold=score_threshold,
-                empty_frames=empty_frames,
-                roi=self.roi,
-                label_version=self.label_version,
-                is_simulated=self.is_simulated,
-                condition=condition,
-                **(vars(curve) | dropped),
-            )
-            results.append(result)
+                results.append(result)
         return results
+
+    def _curves(
+        self,
+        protocol: Protocol,
+        space: str,
+        iou: float,
+        threshold: float,
+        weights: Int[np.ndarray, "F C"],
+    ) -> Iterator[Curve]:
+        """Yields the curve of each class over weighted frames."""
+        geometry, rule, kind = protocol.geometry, protocol.matching, protocol.curve
+        num_gt = (weights * self.gt_count).sum(axis=0).tolist()
+        if rule == "kradar":
+            triples = self._kradar_rankings(geometry, space, iou, threshold)
+            for cls, triple in enumerate(triples):
+                matched, events, every = (x.weighted(weights[:, cls]) for x in triple)
+                yield protocols.kradar_curve(matched, events, every, num_gt[cls], kind)
+            return
+        rankings = self._pooled_rankings(geometry, rule, space, iou, threshold)
+        for cls, (score, frame, is_tp) in enumerate(rankings):
+            weight = weights[frame, cls]
+            yield protocols.pooled_curve(score, is_tp, weight, num_gt[cls], kind)
 
     def _frame_weights(
         self, empty_frames: str, weights: Shaped[np.ndarray, " F"] | None
@@ -367,34 +428,3 @@ class EvaluationSet:
         if empty_frames == "frame":
             counts = counts * (self.gt_count.sum(axis=1, keepdims=True) > 0)
         return np.broadcast_to(counts, self.gt_count.shape)
-
-    def _ranking(
-        self, matched_by: tuple[str, str, str, float], threshold: float, cls: int
-    ) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Returns the inputs of a curve of one class that do not depend on frame weights.
-
-        They are the scores in descending order, their frames, and whether the predictions
-        match. For K-Radar's protocols, there are three such lists with counts in place of
-        matches: for the matches of the first pass, the changes of the true positives of
-        the second pass, and the predictions.
-        """
-        match = self.match(*matched_by)
-        mine = self.by_score[cls]
-        if isinstance(match, matching.KradarMatches):
-            counted = [
-                (match.first_pred, np.ones_like(match.first_pred)),
-                (match.event_pred, match.event_delta),
-                (mine, np.ones_like(mine)),
-            ]
-        else:
-            counted = [(mine, match[mine] >= 0)]
-            threshold = threshold or -1.0  # a threshold of 0 also keeps scores of 0
-        ranked = []
-        for pred, count in counted:
-            keep = (self.pred.cls[pred] == cls) & (self.score[pred] > threshold)
-            pred, count = pred[keep], count[keep]
-            if np.any(np.diff(self.score[pred]) > 0):
-                order = np.argsort(-self.score[pred], kind="stable")
-                pred, count = pred[order], count[order]
-            ranked.append((self.score[pred], self.pred.frame[pred], count))
-        return ranked

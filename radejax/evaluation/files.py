@@ -18,10 +18,10 @@ from radejax.core import files
 from radejax.core.archives import read_npz
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike
-from radejax.core.structures import BOX_FIELDS
+from radejax.core.structures import BOX_FIELDS, Boxes
 from radejax.data.kradar import KRadar
 from radejax.evaluation import boxes
-from radejax.evaluation.boxes import Columns
+from radejax.evaluation.boxes import Columns, column_names, columns_of_boxes
 from radejax.evaluation.kitti import read_kitti
 from radejax.evaluation.report import Report, write_report
 from radejax.evaluation.results import ReportOptions
@@ -34,7 +34,7 @@ LOW_SCORE = 0.1
 
 def read_table(
     path: PathLike, frames: Columns | None = None, *, scored: bool = True
-) -> Columns:
+) -> Boxes:
     """Reads predictions or ground truth from a file or folder.
 
     Args:
@@ -46,9 +46,6 @@ def read_table(
         scored: Whether the file contains predictions with scores; otherwise it contains
             ground truth.
 
-    Returns:
-        Columns frame, box, cls and, if `scored`, score, as for `evaluation.evaluate`.
-
     Raises:
         FileNotFoundError: There is no such file.
         UserError: The kind of file is unknown.
@@ -56,10 +53,9 @@ def read_table(
             the message names the file and the row.
     """
     path = files.as_path(path)
-    wanted = ("frame", "box", "cls", "score")[: 4 if scored else 3]
     columns: Columns
     if _is_kitti(path):
-        columns = read_kitti(path)[1 if scored else 0]
+        columns = columns_of_boxes(read_kitti(path)[scored])
         if frames is not None and (path / "frames.json").is_file():
             # The frame table that `radejax detect` writes maps file numbers to frames.
             names = _read_frames(path / "frames.json")["name"]
@@ -70,15 +66,16 @@ def read_table(
         columns = boxes.columns_of(rows)
     elif path.suffix == ".npz":
         columns = read_npz(path)
-        if missing := [name for name in wanted if name not in columns]:
+        if missing := [x for x in column_names(scored) if x not in columns]:
             raise DataError(f"{path}: lacks {missing}; found {sorted(columns)}")
     else:
         raise UserError(
             f"{path} is neither a .npz or .json file nor a folder of `radejax detect` or in "
             "KITTI's layout"
         )
-    table = {name: columns[name] for name in wanted}
-    return boxes.with_ids(table, frames, str(path), skip=path.is_dir())
+    columns = {name: columns[name] for name in column_names(scored)}
+    table = boxes.with_ids(columns, frames, str(path), skip=path.is_dir())
+    return boxes.read_boxes(table, str(path), scored=scored)
 
 
 def _is_kitti(path: pathlib.Path) -> bool:
@@ -148,7 +145,7 @@ class Source:
 
 def load(
     path: PathLike, source: Source, classes: Sequence[str]
-) -> tuple[Columns, Columns, Columns, dict[str, int]]:
+) -> tuple[Boxes, Boxes, Columns, dict[str, int]]:
     """Loads predictions and their ground truth.
 
     Args:
@@ -172,12 +169,12 @@ def load(
         path = path / "predictions.npz"
     truth, given, left_out = _load_ground_truth(path, source, classes)
     found = read_table(path, given)
-    frames = given or {"frame": np.union1d(truth["frame"], found["frame"])}
-    box = np.array(found["box"], np.float64).reshape(-1, 7)
+    frames = given or {"frame": np.union1d(truth.frame, found.frame)}
+    box = found.box.copy()
     box[:, 2] += source.z_offset_m
     if source.yaw_degrees:
         box[:, 6] = np.deg2rad(box[:, 6])
-    found = {**found, "box": box}
+    found = dataclasses.replace(found, box=box)
     for column, wanted in (("sequence", source.sequences), ("weather", source.weather)):
         if not wanted:
             continue
@@ -193,14 +190,14 @@ def load(
                 f"{', '.join(np.unique(values))}"
             )
         frames = boxes.take(frames, is_chosen)
-        truth = boxes.take(truth, np.isin(truth["frame"], frames["frame"]))
-        found = boxes.take(found, np.isin(found["frame"], frames["frame"]))
+        truth = truth.take(np.isin(truth.frame, frames["frame"]))
+        found = found.take(np.isin(found.frame, frames["frame"]))
     return truth, found, frames, left_out
 
 
 def _load_ground_truth(
     path: pathlib.Path, source: Source, classes: Sequence[str]
-) -> tuple[Columns, Columns | None, dict[str, int]]:
+) -> tuple[Boxes, Columns | None, dict[str, int]]:
     """Returns ground truth, the frame table or None, and counts of labels."""
     if source.ground_truth:
         truth = files.as_path(source.ground_truth)
@@ -210,11 +207,12 @@ def _load_ground_truth(
         frames = _read_frames(table) if table.is_file() else None
         return read_table(truth, frames, scored=False), frames, {}
     if source.data or source.labels:
-        roots = list(source.data) or None
-        version = source.label_version
-        split = None if source.split == "all" else source.split
         data = KRadar(
-            roots, source.labels, version=version, split=split, classes=classes
+            list(source.data) or None,
+            source.labels,
+            version=source.label_version,
+            split=None if source.split == "all" else source.split,
+            classes=classes,
         )
         counts = {f"labels: {what}": int(n) for what, n in data.counts.items()}
         return *boxes.tables_from_frames(data, source.split), counts
@@ -244,7 +242,8 @@ def stored_options(path: PathLike) -> dict[str, Any]:
     Without a report, they are the classes of the config in the folder or its parent, or
     none without a config.
     """
-    place, found = next(iter(report_folders(path).values())), dict[str, Any]()
+    place = next(iter(report_folders(path).values()))
+    found: dict[str, Any] = {}
     for config in (place.parent / "config.json", place / "config.json"):
         if config.is_file():
             found = {"classes": files.read_object(config, "classes")["classes"]}
@@ -282,7 +281,8 @@ def evaluate_files(
     if others:
         raise UserError(f"{path.parents[1]} holds several seeds: name one of them")
     truth, found, frames, left_out = load(path, source, options.classes)
-    warnings, low = [], stored_options(path).get("min_score", 0.0)
+    warnings = []
+    low = stored_options(path).get("min_score", 0.0)
     if low > max(LOW_SCORE, options.score_threshold):
         warnings.append(
             f"{path} has only predictions from score {low:g} on, and every number is of "

@@ -25,9 +25,10 @@ import numpy as np
 
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
-from radejax.core.structures import Detections
+from radejax.core.files import PathLike
+from radejax.core.structures import Boxes, Detections
 from radejax.evaluation import boxes
-from radejax.evaluation.boxes import Columns
+from radejax.evaluation.boxes import AnyBoxes, AnyColumns, Columns
 
 KEYS = ("sed", "bus", "ped", "mot", "bic", "peg", "big")
 CLASS_KEYS = dict(zip(boxes.KNOWN_CLASSES, KEYS, strict=True))
@@ -42,10 +43,10 @@ BOX_ORDER = [5, 4, 3, 1, 2, 0, 6]  # from x y z l w h yaw to h w l y z x yaw
 
 
 def write_kitti(
-    folder: str | pathlib.Path,
-    ground_truth: Columns,
-    predictions: Columns,
-    frames: Columns,
+    folder: PathLike,
+    ground_truth: AnyBoxes,
+    predictions: AnyBoxes,
+    frames: AnyColumns,
     *,
     score_threshold: float = 0.0,
 ) -> int:
@@ -71,17 +72,19 @@ def write_kitti(
         DataError: A frame is not in the frame table.
     """
     ids = boxes.frame_ids(frames)
-    if not len(ground_truth["frame"]):
-        raise UserError("no frame has ground truth: K-Radar's tools write none of them")
-    is_above = np.asarray(predictions["score"]) > score_threshold
 
-    def lines(table: Columns, name: str, *, scored: bool) -> dict[int, list[str]]:
-        frame = boxes.with_ids(table, frames, name)["frame"]
-        numbered = {**table, "frame": boxes.frame_positions(frame, ids, name)}
-        return _lines(numbered, scored=scored)
+    def lines(table: AnyBoxes, name: str, *, scored: bool) -> dict[int, list[str]]:
+        columns = boxes.with_ids(boxes.columns_of_boxes(table), frames, name)
+        position = boxes.frame_positions(columns["frame"], ids, name)
+        columns = {**columns, "frame": position}
+        if scored:
+            columns = boxes.take(columns, columns["score"] > score_threshold)
+        return _lines(columns, scored=scored)
 
     truth = lines(ground_truth, "ground truth", scored=False)
-    found = lines(boxes.take(predictions, is_above), "predictions", scored=True)
+    found = lines(predictions, "predictions", scored=True)
+    if not truth:
+        raise UserError("no frame has ground truth: K-Radar's tools write none of them")
     root = files.as_path(folder) / f"{float(score_threshold)}"
     kinds = [kind for kind in DESCRIPTION if kind in frames]
     listed: dict[pathlib.Path, list[str]] = {}
@@ -136,7 +139,7 @@ def _lines(table: Columns, *, scored: bool) -> dict[int, list[str]]:
     return lines
 
 
-def read_kitti(folder: str | pathlib.Path) -> tuple[Columns, Columns, Columns]:
+def read_kitti(folder: PathLike) -> tuple[Boxes, Boxes, Columns]:
     """Reads ground truth, predictions and frame table from a folder of K-Radar's tools.
 
     Args:
@@ -174,12 +177,8 @@ def _find_root(folder: pathlib.Path) -> pathlib.Path:
     )
 
 
-def _read_folder(folder: pathlib.Path, *, scored: bool) -> tuple[list[int], Columns]:
-    """Reads a folder, which may be missing.
-
-    Returns:
-        The numbers of the files, and the columns of all lines.
-    """
+def _read_folder(folder: pathlib.Path, *, scored: bool) -> tuple[list[int], Boxes]:
+    """Reads the numbers of the files in a folder, which may be missing, and their boxes."""
     numbers, rows = [], []
     for path in sorted(folder.glob("*.txt")):
         if not re.fullmatch("[0-9]{1,9}", path.stem):
@@ -190,7 +189,8 @@ def _read_folder(folder: pathlib.Path, *, scored: bool) -> tuple[list[int], Colu
         for number, line in enumerate(files.read_text(path).splitlines(), 1):
             if row := _read_line(line, scored, f"{path}: line {number}"):
                 rows.append((numbers[-1], *row))
-    return numbers, boxes.columns_of(rows)
+    table = boxes.columns_of(rows)
+    return numbers, boxes.read_boxes(table, str(folder), scored=scored)
 
 
 def _read_line(line: str, scored: bool, where: str) -> tuple | None:

@@ -24,7 +24,7 @@ import itertools
 import pathlib
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from tabulate import LATEX_ESCAPE_RULES, tabulate
@@ -33,7 +33,7 @@ from radejax.core import files
 from radejax.core.files import PathLike
 from radejax.data.kradar.conditions import WEATHERS
 from radejax.evaluation import analysis, protocols
-from radejax.evaluation.boxes import Columns, roi_name, write_boxes
+from radejax.evaluation.boxes import AnyBoxes, Columns, roi_name, write_boxes
 from radejax.evaluation.evaluation_set import EvaluationSet, Result
 from radejax.evaluation.kitti import write_kitti
 from radejax.evaluation.results import (
@@ -64,8 +64,8 @@ class Report:
 
 
 def write_report(
-    ground_truth: Columns,
-    predictions: Columns,
+    ground_truth: AnyBoxes,
+    predictions: AnyBoxes,
     frames: Columns,
     out_dir: PathLike,
     options: ReportOptions,
@@ -77,8 +77,8 @@ def write_report(
     """Evaluates predictions in the given protocols and `all_point`, and writes the report.
 
     Args:
-        ground_truth: Columns as for `evaluation.evaluate`.
-        predictions: Such columns with scores.
+        ground_truth: Boxes or columns as for `evaluation.evaluate`.
+        predictions: The same with scores.
         frames: Frame table with the column frame `[F]` (ids) and, as far as known, name,
             sequence, weather, environment, time, simulated and split.
         out_dir: Folder of the report. Files in it are replaced when all are written.
@@ -97,9 +97,11 @@ def write_report(
     data = make_set(ground_truth, predictions, frames, options)
     results = compute_results(data, frames, options)
     iou = options.iou_thresholds[0]
-    settings = f"3d, IoU {iou:g}, score>{options.min_score:g}; precision and recall "
-    settings += f"at score>{analysis.OPERATING_SCORE:g}"
-    subsets = {"protocol": f"{protocols.RECOMMENDED}, {settings}"}
+    subsets = {
+        "protocol": f"{protocols.RECOMMENDED}, 3d, IoU {iou:g}, score>"
+        f"{options.min_score:g}; precision and recall at score>"
+        f"{analysis.OPERATING_SCORE:g}"
+    }
     # The split is that of all frames, or None if it is unknown or differs.
     splits = np.unique(np.asarray(frames.get("split", [])).astype(str))
     metrics = {
@@ -122,8 +124,9 @@ def write_report(
     }
     metrics = plain(metrics)
     by_key = {result.key: result for result in results}
-    text = _console_text(metrics, by_key, options)
-    built = _tables(metrics, by_key, options)
+    tables = RunTables(run, by_key, options, metrics["split"])
+    text = _console_text(metrics, tables)
+    built = _all_tables(metrics, tables)
     with files.swapped_in(out_dir) as folder:
         # The inputs are stored with the report, so that reports can be compared later.
         columns = {name: np.asarray(column).tolist() for name, column in frames.items()}
@@ -142,26 +145,25 @@ def write_report(
         write_boxes(folder / "predictions.npz", data.predictions, frames)
         write_boxes(folder / "ground_truth.npz", data.ground_truth, frames)
         if options.kitti:
-            truth, found = map(vars, data.evaluated())
             least = options.settings_of("kradar_r40")["score_threshold"]
-            write_kitti(folder / "kitti", truth, found, frames, score_threshold=least)
+            write_kitti(
+                folder / "kitti", *data.evaluated(), frames, score_threshold=least
+            )
         if options.plots:
             _draw_curves(data, frames, options, folder)
     return Report(text, metrics, results, pathlib.Path(out_dir))
 
 
-def _tables(
-    metrics: Mapping[str, Any], results: Results, options: ReportOptions
-) -> list[Table]:
+def _all_tables(metrics: Mapping[str, Any], tables: RunTables) -> list[Table]:
     """Builds the tables in the papers' layouts, of all protocols and IoUs, and of details."""
-    ious, subsets = options.iou_thresholds, metrics["subsets"]
+    options, subsets = tables.options, metrics["subsets"]
     built = []
-    if not metrics["is_simulated"] and metrics["options"]["label_version"]:
-        built += paper_tables(metrics["run"], results, options, metrics["split"])
-    for space, iou in itertools.product(SPACES, ious):
-        built.append(by_protocol(results, options, space, iou))
-    for protocol, iou in itertools.product(options.protocols, ious):
-        built.append(class_by_weather(results, options, protocol, iou))
+    if not metrics["is_simulated"] and options.label_version:
+        built += tables.papers()
+    for space, iou in itertools.product(SPACES, options.iou_thresholds):
+        built.append(tables.by_protocol(space, iou))
+    for protocol, iou in itertools.product(options.protocols, options.iou_thresholds):
+        built.append(tables.by_weather(protocol, iou))
     built += [subset_table(subsets, kind) for kind in subsets if kind != "protocol"]
     built.append(error_table(metrics["box_errors"]))
     names = ["frame", "name", "sequence", "missed", "false", "found"]
@@ -169,17 +171,15 @@ def _tables(
     return [*built, worst]
 
 
-def _console_text(
-    metrics: Mapping[str, Any], results: Results, options: ReportOptions
-) -> str:
+def _console_text(metrics: Mapping[str, Any], tables: RunTables) -> str:
     """Formats the most important tables for the console."""
+    options = tables.options
     iou = options.iou_thresholds[0]
     # The first protocol is shown at two IoU thresholds, the others at one.
     first, *others = options.main_protocols
-    shown = [(first, level) for level in options.iou_thresholds[:2]]
-    shown += [(protocol, iou) for protocol in others]
-    built = [class_by_weather(results, options, *terms) for terms in shown]
-    built += [by_protocol(results, options, space, iou) for space in SPACES]
+    built = [tables.by_weather(first, level) for level in options.iou_thresholds[:2]]
+    built += [tables.by_weather(protocol, iou) for protocol in others]
+    built += [tables.by_protocol(space, iou) for space in SPACES]
     built.append(subset_table(metrics["subsets"], "distance"))
     built.append(error_table(metrics["box_errors"]))
     kind = "simulated " if metrics["is_simulated"] else ""
@@ -245,8 +245,6 @@ SPACES = ("3d", "bev")
 """Box spaces in the order of the papers' tables."""
 
 STYLES = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
-Results = Mapping[tuple[str, str, str, str, float], Result]
-"""Results by protocol, condition, class, space and IoU threshold."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -308,53 +306,6 @@ def numbers(values: Iterable[float | None], **options: Any) -> list[str]:
     return [number(value, **options) for value in values]
 
 
-def ap_of(results: Results, *key: Any) -> float | None:
-    """Returns the AP of a key, or None if the class does not occur or there is no result."""
-    result = results.get(key)
-    return None if result is None else result.ap_or_none
-
-
-def terms_of(results: Results, protocol: str) -> str:
-    """Returns a protocol with its score threshold, empty-frame rule, labels and region."""
-    found = next(r for r in results.values() if r.protocol == protocol)
-    return ", ".join(found.metric.split("/")[1:])
-
-
-def class_by_weather(
-    results: Results, options: ReportOptions, protocol: str, iou: float
-) -> Table:
-    """Builds the table of classes by weather in one protocol, with "3D / BEV" entries."""
-    conditions = dict.fromkeys(key[1] for key in results)
-    body = []
-    for cls in (*options.classes, "mean"):
-        pairs = (
-            [ap_of(results, protocol, name, cls, space, iou) for space in SPACES]
-            for name in conditions
-        )
-        body.append([cls, *(" / ".join(numbers(pair)) for pair in pairs)])
-    title = f"AP 3D / BEV at IoU {iou:g}, {terms_of(results, protocol)}"
-    return Table(title, ["Class", *(TITLES.get(x, x) for x in conditions)], body)
-
-
-def by_protocol(
-    results: Results, options: ReportOptions, space: str, iou: float
-) -> Table:
-    """Builds the table of protocols by classes over all weathers.
-
-    The entries include the intervals over sequences if they were computed.
-    """
-    classes = (*options.classes, "mean")
-    body = []
-    for name in options.protocols:
-        found = (results[name, "all", cls, space, iou] for cls in classes)
-        terms = f"{name}, score>{options.settings_of(name)['score_threshold']:g}"
-        body.append([terms, *map(_with_interval, found)])
-    title = f"AP {space.upper()} at IoU {iou:g} in every protocol, all weathers"
-    if any(result.has_interval for result in results.values()):
-        title += f", 95 % intervals of {options.bootstrap} resamples of sequences"
-    return Table(title, ["Protocol", *classes], body)
-
-
 def _with_interval(result: Result) -> str:
     """Formats an AP with its interval, if there is one, such as "61.05 [50.1, 70.2]"."""
     if not (result.is_defined and result.has_interval):
@@ -401,20 +352,17 @@ def _table_of(
 
 CONDITIONS = ("all", *WEATHERS)
 
-Cell = tuple[str, str, str, float]
-"""Condition, class, space and IoU threshold."""
-
-Place = dict[str, Any]
-"""Some fields of a `Cell` by name; the others have the values in `_USUAL`."""
-
-_ABLATIONS = ["RADE-Net, Table III", "DinoRADE, Table 4"]
+ABLATIONS = ("RADE-Net, Table III", "DinoRADE, Table 4")
 """Ablation tables, with whose rows a run is not compared."""
 
-_OF_OTHERS = ("Sedan", "Bus or Truck", "mean")
-"""Classes of most other methods."""
 
-_BOTH: list[Place] = [{"space": space} for space in SPACES]
-_USUAL: Place = {"condition": "all", "cls": "Sedan", "space": "3d", "iou": 0.3}
+class Cell(NamedTuple):
+    """Place of an AP in the tables of the papers."""
+
+    condition: str = "all"
+    cls: str = "Sedan"
+    space: str = "3d"
+    iou: float = 0.3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -462,34 +410,17 @@ class PublishedRow:
         known = [term for term in terms if not re.search("[>=]not stated", term)]
         return ", ".join(known)
 
-    def differences(
-        self,
-        cells: Sequence[Cell],
-        ours: Sequence[float | None],
-        options: ReportOptions,
-        split: str | None,
-    ) -> list[str]:
-        """Formats our APs minus the printed ones, with "-" if they are not comparable.
-
-        A mean is compared only with a mean over the same classes.
-        """
-        is_comparable = (
+    def is_comparable(self, options: ReportOptions, split: str | None) -> bool:
+        """Whether protocol, score threshold, labels, region and split are the same."""
+        return (
             options.paper_protocol == self.protocol
             and options.settings_of(self.protocol)["score_threshold"]
             == float(self.score_threshold)
             and options.label_version == self.label_version
             and roi_name(options.roi) == self.region
             and split == "test"
-            and self.source not in _ABLATIONS
+            and self.source not in ABLATIONS
         )
-        classes = {cls for _, cls, *_ in self.values} - {"mean"}
-        gaps: list[float | None] = []
-        for cell, ap in zip(cells, ours, strict=True):
-            printed = self.values.get(cell, "-")
-            is_same = cell[1] != "mean" or classes == set(options.classes)
-            exists = is_comparable and is_same and printed != "-"
-            gaps.append(ap - float(printed) if exists and ap is not None else None)
-        return numbers(gaps, signed=True)
 
 
 def _read() -> tuple[PublishedRow, ...]:
@@ -501,7 +432,7 @@ def _read() -> tuple[PublishedRow, ...]:
         fields = {name: line[name] for name in names}
         row = rows.setdefault(tuple(fields.values()), PublishedRow(**fields, values={}))
         for condition in filter(line.get, CONDITIONS):
-            cell = condition, line["cls"], line["space"], float(line["iou"])
+            cell = Cell(condition, line["cls"], line["space"], float(line["iou"]))
             row.values[cell] = line[condition]
     return tuple(rows.values())
 
@@ -510,107 +441,169 @@ PUBLISHED = _read()
 """All rows of all result tables of both papers, and of other sources."""
 
 
-# A run in the layouts of the papers ---------------------------------------------------
+# Tables of a run ----------------------------------------------------------------------
+
+Place = Mapping[str, Any]
+"""Fields of a `Cell` by name."""
 
 
-def paper_tables(
-    run: str, results: Results, options: ReportOptions, split: str | None
-) -> list[Table]:
-    """Builds the tables in the papers' layouts that the classes and IoUs allow.
+@dataclasses.dataclass(frozen=True)
+class RunTables:
+    """Tables of the average precisions of one run.
 
-    Args:
+    Attributes:
         run: Name of the run.
-        results: Results of frames that are not simulated.
+        results: Results by their `key`.
         options: Options of the evaluation.
         split: Split of the frames, or None if it is not known.
-
-    Returns:
-        Tables in the order of the papers.
     """
-    if 0.3 not in options.iou_thresholds:
-        return []
-    classes = [{"cls": cls} for cls in (*options.classes, "mean")]
-    conditions = [{"condition": name} for name in CONDITIONS]
-    sedan = [{"cls": "Sedan"}]
-    ious = _crossed([{"iou": 0.3}, {"iou": 0.5}], _BOTH)
-    common = [group for group in classes if group["cls"] in _OF_OTHERS]
-    elsewhere = [row.source for row in PUBLISHED if ", Table" not in row.source]
-    layouts: list[tuple[str, Sequence[str], list[Place], list[Place]]] = [
-        (
+
+    run: str
+    results: Mapping[tuple[str, str, str, str, float], Result]
+    options: ReportOptions
+    split: str | None = None
+
+    def _aps(self, protocol: str, cells: Iterable[Cell]) -> list[float | None]:
+        """Returns APs, which are None if a class does not occur or there is no result."""
+        found = [self.results.get((protocol, *cell)) for cell in cells]
+        return [None if result is None else result.ap_or_none for result in found]
+
+    def _terms(self, protocol: str) -> str:
+        """Returns a protocol with its score threshold, empty-frame rule, labels and region."""
+        found = next(r for r in self.results.values() if r.protocol == protocol)
+        return ", ".join(found.metric.split("/")[1:])
+
+    def by_weather(self, protocol: str, iou: float) -> Table:
+        """Builds the table of classes by weather in one protocol, with "3D / BEV" entries."""
+        conditions = dict.fromkeys(key[1] for key in self.results)
+        body = []
+        for cls in (*self.options.classes, "mean"):
+            pairs = [[Cell(name, cls, x, iou) for x in SPACES] for name in conditions]
+            entries = [numbers(self._aps(protocol, pair)) for pair in pairs]
+            body.append([cls, *map(" / ".join, entries)])
+        title = f"AP 3D / BEV at IoU {iou:g}, {self._terms(protocol)}"
+        return Table(title, ["Class", *(TITLES.get(x, x) for x in conditions)], body)
+
+    def by_protocol(self, space: str, iou: float) -> Table:
+        """Builds the table of protocols by classes over all weathers.
+
+        The entries include the intervals over sequences if they were computed.
+        """
+        classes = (*self.options.classes, "mean")
+        body = []
+        for name in self.options.protocols:
+            found = (self.results[name, "all", cls, space, iou] for cls in classes)
+            threshold = self.options.settings_of(name)["score_threshold"]
+            body.append([f"{name}, score>{threshold:g}", *map(_with_interval, found)])
+        title = f"AP {space.upper()} at IoU {iou:g} in every protocol, all weathers"
+        if any(result.has_interval for result in self.results.values()):
+            count = self.options.bootstrap
+            title += f", 95 % intervals of {count} resamples of sequences"
+        return Table(title, ["Protocol", *classes], body)
+
+    def papers(self) -> list[Table]:
+        """Builds the tables in the papers' layouts that the classes and IoUs allow.
+
+        The frames must not be simulated.
+        """
+        if 0.3 not in self.options.iou_thresholds:
+            return []
+        spaces: list[Place] = [{"space": space} for space in SPACES]
+        conditions = [{"condition": name} for name in CONDITIONS]
+        classes = [{"cls": cls} for cls in (*self.options.classes, "mean")]
+        of_others = ("Sedan", "Bus or Truck", "mean")  # classes of most other methods
+        common = [place for place in classes if place["cls"] in of_others]
+        ious = _crossed([{"iou": 0.3}, {"iou": 0.5}], spaces)
+        elsewhere = [row.source for row in PUBLISHED if ", Table" not in row.source]
+        tables = [
+            self._layout(
+                "Classes by weather at IoU 0.3 (layout of Table II)",
+                ["RADE-Net, Table II", "DinoRADE, Table 2"],
+                classes,
+                _crossed(conditions, spaces),
+            ),
+            self._layout(
+                "Classes, all weathers, IoU 0.3 (layout of DinoRADE's Table 3)",
+                ["DinoRADE, Table 3"],
+                [{"condition": "all"}],
+                _crossed(classes, spaces),
+            ),
+        ]
+        if "Sedan" not in self.options.classes:
+            return tables  # the others show sedans
+        first = self._layout(
             "Sedan by weather at IoU 0.3 (layout of Table I)",
             ["RADE-Net, Table I", "DinoRADE, Table 1"],
-            _BOTH,
+            spaces,
             conditions,
-        ),
-        (
-            "Classes by weather at IoU 0.3 (layout of Table II)",
-            ["RADE-Net, Table II", "DinoRADE, Table 2"],
-            classes,
-            _crossed(conditions, _BOTH),
-        ),
-        (
-            "Classes, all weathers, IoU 0.3 (layout of DinoRADE's Table 3)",
-            ["DinoRADE, Table 3"],
-            [{"condition": "all"}],
-            _crossed(classes, _BOTH),
-        ),
-        ("Ablations, Sedan (layout of Table III)", _ABLATIONS, sedan, ious),
-        ("Other methods, all weathers, as printed elsewhere", elsewhere, common, ious),
-    ]
-    if "Sedan" not in options.classes:
-        layouts = layouts[1:3]  # the others show sedans
-    return [_layout(run, results, options, split, *layout) for layout in layouts]
+        )
+        ablations = "Ablations, Sedan (layout of Table III)"
+        others = "Other methods, all weathers, as printed elsewhere"
+        return [
+            first,
+            *tables,
+            self._layout(ablations, ABLATIONS, [{"cls": "Sedan"}], ious),
+            self._layout(others, elsewhere, common, ious),
+        ]
+
+    def _layout(
+        self,
+        title: str,
+        sources: Sequence[str],
+        groups: Sequence[Place],
+        columns: Sequence[Place],
+    ) -> Table:
+        """Builds a table of published rows, each with our difference to it, and our rows.
+
+        Args:
+            title: Title of the table.
+            sources: Papers and tables whose rows are printed.
+            groups: Condition, class, space or IoU threshold of each group of rows.
+            columns: Condition, class, space or IoU threshold of each column.
+        """
+        body: list[list[str]] = []
+        for group in groups:
+            of = _name(group)
+            cells = [Cell(**group, **column) for column in columns]
+            printed = []
+            for row in PUBLISHED:
+                values = [row.values.get(cell, "-") for cell in cells]
+                # Both papers contain the same rows of other methods.
+                is_repeated = [row.method, *values] in printed
+                if row.source not in sources or set(values) == {"-"} or is_repeated:
+                    continue
+                printed.append([row.method, *values])
+                name = f"{row.method} ({row.sensors})"
+                body.append([name, of, row.source, row.terms, *values])
+                gaps = self._differences(row, cells)
+                if set(gaps) != {"-"}:
+                    same = "same protocol, score, labels, region, split"
+                    body.append(["difference", of, row.source, same, *gaps])
+            for protocol in self.options.main_protocols:
+                aps = numbers(self._aps(protocol, cells))
+                body.append([self.run, of, "", self._terms(protocol), *aps])
+        header = ["Method", "Of", "Source", "Terms", *map(_name, columns)]
+        return Table(title, header, body)
+
+    def _differences(self, row: PublishedRow, cells: Sequence[Cell]) -> list[str]:
+        """Formats our APs minus the printed ones, with "-" if they are not comparable.
+
+        A mean is compared only with a mean over the same classes.
+        """
+        is_comparable = row.is_comparable(self.options, self.split)
+        classes = {cell.cls for cell in row.values} - {"mean"}
+        gaps: list[float | None] = []
+        ours = self._aps(self.options.paper_protocol, cells)
+        for cell, ap in zip(cells, ours, strict=True):
+            printed = row.values.get(cell, "-")
+            is_same = cell.cls != "mean" or classes == set(self.options.classes)
+            exists = is_comparable and is_same and printed != "-"
+            gaps.append(ap - float(printed) if exists and ap is not None else None)
+        return numbers(gaps, signed=True)
 
 
 def _crossed(outer: Sequence[Place], inner: Sequence[Place]) -> list[Place]:
     return [{**one, **other} for one in outer for other in inner]
-
-
-def _layout(
-    run: str,
-    results: Results,
-    options: ReportOptions,
-    split: str | None,
-    title: str,
-    sources: Sequence[str],
-    groups: Sequence[Place],
-    columns: Sequence[Place],
-) -> Table:
-    """Builds a table of published rows, each with our difference to it, and our rows.
-
-    Args:
-        run: Name of the run.
-        results: Results of the run.
-        options: Options of the evaluation.
-        split: Split of the frames, or None if it is not known.
-        title: Title of the table.
-        sources: Papers and tables whose rows are printed.
-        groups: Condition, class, space or IoU threshold of each group of rows.
-        columns: Condition, class, space or IoU threshold of each column.
-    """
-    body: list[list[str]] = []
-    for group in groups:
-        places = [{**_USUAL, **group, **column} for column in columns]
-        cells = [(p["condition"], p["cls"], p["space"], p["iou"]) for p in places]
-        of, printed = _name(group), []
-        compared = [ap_of(results, options.paper_protocol, *cell) for cell in cells]
-        for row in PUBLISHED:
-            values = [row.values.get(cell, "-") for cell in cells]
-            # Both papers contain the same rows of other methods.
-            is_repeated = [row.method, *values] in printed
-            if row.source not in sources or set(values) == {"-"} or is_repeated:
-                continue
-            printed.append([row.method, *values])
-            name = f"{row.method} ({row.sensors})"
-            body.append([name, of, row.source, row.terms, *values])
-            gaps = row.differences(cells, compared, options, split)
-            if set(gaps) != {"-"}:
-                same = "same protocol, score, labels, region, split"
-                body.append(["difference", of, row.source, same, *gaps])
-        for protocol in options.main_protocols:
-            aps = [ap_of(results, protocol, *cell) for cell in cells]
-            body.append([run, of, "", terms_of(results, protocol), *numbers(aps)])
-    return Table(title, ["Method", "Of", "Source", "Terms", *map(_name, columns)], body)
 
 
 def _name(place: Place) -> str:

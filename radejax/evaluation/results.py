@@ -20,10 +20,16 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from radejax.core.errors import UserError, require
 from radejax.core.options import AtLeastOne, BelowOne, Count, Fraction, Options
-from radejax.core.structures import CLASSES, MIN_SIZE_M, NARROW_ROI
+from radejax.core.structures import CLASSES, MIN_SIZE_M, NARROW_ROI, Boxes
 from radejax.data.kradar.conditions import WEATHERS
 from radejax.evaluation import protocols
-from radejax.evaluation.boxes import AnyColumns, Columns, roi_bounds
+from radejax.evaluation.boxes import (
+    AnyBoxes,
+    AnyColumns,
+    Columns,
+    read_boxes,
+    roi_bounds,
+)
 from radejax.evaluation.evaluation_set import EvaluationSet, Result, mean_ap
 
 LEVEL = 0.95
@@ -120,6 +126,8 @@ class ReportOptions(EvaluationOptions):
         return {"score_threshold": threshold, "empty_frames": self.empty_frames}
 
 
+_NO_CURVE: dict[str, Any] = dict.fromkeys(("precision", "recall", "score"), np.zeros(0))
+
 SAME_NUMBERS = frozenset(
     ["bootstrap", "batch_size", "num_visualizations", "figures", "plots", "kitti"]
 )
@@ -142,16 +150,16 @@ def name_of_changes(changes: Mapping[str, Any], usual: Mapping[str, Any]) -> str
 
 
 def make_set(
-    ground_truth: Columns,
-    predictions: Columns,
-    frames: Columns,
+    ground_truth: AnyBoxes,
+    predictions: AnyBoxes,
+    frames: AnyColumns,
     options: ReportOptions,
 ) -> EvaluationSet:
     """Builds the evaluation set; repaired and clipped predictions are counted in it.
 
     Args:
-        ground_truth: Columns as for `evaluation.evaluate`.
-        predictions: Such columns with scores.
+        ground_truth: Boxes or columns as for `evaluation.evaluate`.
+        predictions: The same with scores.
         frames: Frame table.
         options: Settings of the evaluation.
 
@@ -160,7 +168,7 @@ def make_set(
         DataError: A row is invalid; the message names the table, frame and row.
     """
     predictions, num_invalid = repair_sizes(predictions, options.invalid_sizes)
-    sizes = np.asarray(predictions["box"], np.float64).reshape(-1, 7)[:, 3:6]
+    sizes = predictions.box[:, 3:6]
     is_clipped = ((sizes > 1e-6) & (sizes <= np.float32(MIN_SIZE_M))).any(axis=1)
     data = EvaluationSet(
         ground_truth,
@@ -212,10 +220,11 @@ def compute_results(
                 protocol,
                 iou_thresholds=options.iou_thresholds,
                 weights=mask,
-                curves=False,
                 condition=condition,
                 **settings,
             )
+            # The curves of all results would take much memory.
+            results = [dataclasses.replace(row, **_NO_CURVE) for row in results]
             for start in range(0, len(results), len(data.classes)):
                 group = results[start : start + len(data.classes)]
                 group.append(_mean(group))
@@ -281,10 +290,10 @@ def resample(
     The AP is NaN if a resample has no object of the class. The mean is over the classes
     that occur. `settings` are further arguments of `EvaluationSet.results`.
     """
-    metric: dict[str, Any] = {"iou_thresholds": iou, "spaces": space, **settings}
+    settings |= {"iou_thresholds": iou, "spaces": space}
     samples = []
     for weight in weights:
-        results = data.results(protocol, weights=weight, curves=False, **metric)
+        results = data.results(protocol, weights=weight, **settings)
         samples.append([*(result.ap_or_none for result in results), mean_ap(results)])
     return np.array(samples, np.float64)  # None becomes NaN
 
@@ -345,23 +354,22 @@ def exclusion_counts(data: EvaluationSet, options: ReportOptions) -> dict[str, i
     return data.left_out | {what: int(mask.sum()) for what, mask in masks.items()}
 
 
-def repair_sizes(predictions: Columns, rule: str) -> tuple[Columns, int]:
+def repair_sizes(predictions: AnyBoxes, rule: str) -> tuple[Boxes, int]:
     """Repairs boxes with sizes that are not positive, as of an untrained network.
 
     Args:
-        predictions: Columns as for `evaluation.evaluate`.
+        predictions: Boxes or columns as for `evaluation.evaluate`.
         rule: "error" does not change them; "false_positive" sets all sizes of such boxes
             to a micrometer, so that they match nothing but count as predictions.
 
     Returns:
         The predictions and the number of changed boxes.
     """
-    box = np.array(predictions["box"], np.float64).reshape(-1, 7)
-    is_invalid = (box[:, 3:6] <= 0).any(axis=1)
-    if rule == "error" or not is_invalid.any():
-        return predictions, 0
+    found = read_boxes(predictions, "predictions", scored=True)
+    is_invalid = (found.box[:, 3:6] <= 0).any(axis=1) & (rule == "false_positive")
+    box = found.box.copy()
     box[is_invalid, 3:6] = 1e-6
-    return {**predictions, "box": box}, int(is_invalid.sum())
+    return dataclasses.replace(found, box=box), int(is_invalid.sum())
 
 
 def to_row(result: Result) -> dict[str, Any]:
