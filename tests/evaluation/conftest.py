@@ -1,32 +1,30 @@
-"""Loads the slow reference and makes random scenes."""
+"""Scenes, and reports and comparisons of them as files."""
 
 import pathlib
 
 import numpy as np
 import pytest
 
-from radejax.config import load_module
 from radejax.core import files
 from radejax.evaluation.boxes import frame_keys, read_boxes, write_boxes
 from radejax.evaluation.files import Source
+from radejax.evaluation.report import write_report
+from radejax.evaluation.results import ReportOptions
 
-HERE = pathlib.Path(__file__).parent
+from .scenes import random_scene
 
-
-def _load(name):
-    return load_module(HERE / f"{name}.py")
-
-
-@pytest.fixture(scope="session")
-def reference():
-    """The second, slow implementation."""
-    return _load("reference")
+STORED = pathlib.Path(__file__).parent / "stored"
+"""Texts that version 0.3 wrote for the scenes of these tests."""
 
 
 @pytest.fixture(scope="session")
-def random_scene():
-    """Function (seed, ...) -> ground truth, predictions, frames."""
-    return _load("scenes").random_scene
+def assert_stored():
+    """Function (path) that compares a text file with the stored one of the same name."""
+
+    def compare(path, name=None):
+        assert path.read_text() == (STORED / (name or path.name)).read_text()
+
+    return compare
 
 
 @pytest.fixture(scope="session")
@@ -58,9 +56,8 @@ def write_table():
             boxes = read_boxes(table, path.name, scored="score" in table)
             return write_boxes(path, boxes, frames)
         keys = frame_keys(frames) if "name" in frames else frames["frame"].tolist()
-        frame = [keys[i] for i in table["frame"]]
-        columns = {name: column.tolist() for name, column in table.items()}
-        columns["frame"] = frame
+        columns = {name: np.asarray(column).tolist() for name, column in table.items()}
+        columns["frame"] = [keys[i] for i in columns["frame"]]
         rows = zip(*columns.values(), strict=True)
         return files.write_json(
             path, [dict(zip(columns, r, strict=True)) for r in rows]
@@ -70,18 +67,40 @@ def write_table():
 
 
 @pytest.fixture(scope="session")
-def stored_scene(random_scene):
-    """Ground truth, predictions, frames of `stored`."""
+def scene():
+    """Ground truth, predictions and frames of `stored` and `two_runs`."""
     return random_scene(8, num_frames=30, num_objects=90)
 
 
 @pytest.fixture
-def stored(stored_scene, write_table, tmp_path):
+def stored(scene, write_table, tmp_path):
     """Folder with predictions, ground truth and frames as files, and their `Source`."""
-    truth, found, frames = stored_scene
+    truth, found, frames = scene
     write_table(tmp_path / "found.json", found, frames)
     write_table(tmp_path / "truth.npz", truth, frames)
     files.write_json(
         tmp_path / "frames.json", {k: v.tolist() for k, v in frames.items()}
     )
     return tmp_path, Source(ground_truth=str(tmp_path / "truth.npz"))
+
+
+@pytest.fixture(scope="module")
+def two_runs(scene, tmp_path_factory):
+    """Folder with the runs `a` and `b`, which have reports of three seeds each."""
+    folder = tmp_path_factory.mktemp("runs")
+    truth, found, frames = scene
+    options = ReportOptions(
+        roi=None,
+        plots=False,
+        protocols=("all_point", "kradar_r40"),
+        score_threshold=0.4,
+        min_score=0.1,
+        classes=("Sedan",),
+    )
+    for run, keep in (("a", 0.5), ("b", 0.9)):
+        for seed in range(3):
+            rows = np.random.default_rng(seed).random(len(found["score"])) < keep
+            table = {k: v[rows] for k, v in found.items()}
+            place = folder / run / f"seed{seed}" / "evaluation"
+            write_report(truth, table, frames, place, options, run=run)
+    return folder

@@ -4,12 +4,9 @@ import pytest
 from radejax.core.errors import DataError, UserError
 from radejax.evaluation import evaluate, kitti
 
-CLASSES = ("Sedan", "Bus or Truck")
+from .scenes import random_scene
 
-
-@pytest.fixture
-def scene(random_scene):
-    return random_scene(4)
+TRUTH, FOUND, FRAMES = random_scene(4)
 
 
 def test_lines_as_the_official_tools_write_them(tmp_path):
@@ -31,66 +28,55 @@ def test_lines_as_the_official_tools_write_them(tmp_path):
         "time": np.array(["day", "night"]),
     }
     assert kitti.write_kitti(tmp_path, truth, found, frames) == 1
-    root = tmp_path / "0.0" / "all"
-    assert (root / "gts/000001.txt").read_text() == (
-        "sed 0.00 0 0 50 50 150 150 1.6 1.9 4.2 -2.3 0.5 30.13 -3.14\n"
-        "bus 0.00 0 0 50 50 150 150 1.6 1.9 4.2 -2.3 0.5 30.13 -3.14\n"
-    )
-    assert (root / "preds/000001.txt").read_text() == (
-        "bic -1 -1 0 50 50 150 150 1.5 2.0 4.0 -2.25 0.125 30.5 0.1 0.75\n"
-    )
-    assert (root / "desc/000001.txt").read_text() == "night\nhighway\nrain"
-    assert (root / "val.txt").read_text() == "000001\n"
-    for condition in ("rain", "highway", "night"):
-        part = tmp_path / "0.0" / condition
-        assert (part / "preds/000001.txt").is_file()
-        assert (part / "val.txt").read_text() == "000001\n"
+    texts = {
+        "gts/000001.txt": "sed 0.00 0 0 50 50 150 150 1.6 1.9 4.2 -2.3 0.5 30.13 -3.14\n"
+        "bus 0.00 0 0 50 50 150 150 1.6 1.9 4.2 -2.3 0.5 30.13 -3.14\n",
+        "preds/000001.txt": "bic -1 -1 0 50 50 150 150 1.5 2.0 4.0 -2.25 0.125 30.5 0.1 "
+        "0.75\n",
+        "desc/000001.txt": "night\nhighway\nrain",
+        "val.txt": "000001\n",
+    }
+    for condition in ("all", "rain", "highway", "night"):
+        for name, text in texts.items():
+            assert (tmp_path / "0.0" / condition / name).read_text() == text
     assert not (tmp_path / "0.0" / "fog").exists()
 
 
-def test_round_trip_gives_the_same_results(tmp_path, scene):
-    truth, found, frames = scene
-    written = kitti.write_kitti(tmp_path, truth, found, frames)
-    truth2, found2, frames2 = kitti.read_kitti(tmp_path)
-    assert written == np.unique(truth["frame"]).size == frames2["frame"].size
+def test_round_trip_gives_the_same_results(tmp_path):
+    written = kitti.write_kitti(tmp_path, TRUTH, FOUND, FRAMES)
+    truth, found, frames = kitti.read_kitti(tmp_path)
+    assert written == np.unique(TRUTH["frame"]).size == frames["frame"].size
     for name in ("weather", "environment", "time"):
-        np.testing.assert_array_equal(frames2[name], frames[name][frames2["frame"]])
-    np.testing.assert_array_equal(truth2["box"], np.round(truth["box"], 2))
+        np.testing.assert_array_equal(frames[name], FRAMES[name][frames["frame"]])
+    np.testing.assert_array_equal(truth.box, np.round(TRUTH["box"], 2))
     for protocol in ("kradar_r40", "kradar_r11", "kradar_r40_corrected"):
-        terms = {"classes": CLASSES, "protocol": protocol, "iou_thresholds": (0.3, 0.5)}
-        one = evaluate(truth, found, frames=frames, **terms)
-        other = evaluate(truth2, found2, frames=frames2, **terms)
+        terms = {"protocol": protocol, "iou_thresholds": (0.3, 0.5)}
+        one = evaluate(TRUTH, FOUND, frames=FRAMES, **terms)
+        other = evaluate(truth, found, frames=frames, **terms)
         assert [r.ap for r in one] == [r.ap for r in other]
     part, _, _ = kitti.read_kitti(tmp_path / "0.0" / "fog")
-    in_fog = frames["weather"][truth["frame"]] == "fog"
-    assert part["cls"].size == in_fog.sum()
+    assert len(part) == (FRAMES["weather"][TRUTH["frame"]] == "fog").sum()
 
 
-def test_score_cut_and_dummy_lines(tmp_path, scene):
-    truth, found, frames = scene
-    kitti.write_kitti(tmp_path, truth, found, frames, score_threshold=0.5)
+def test_score_threshold_and_dummy_lines(tmp_path):
+    kitti.write_kitti(tmp_path, TRUTH, FOUND, FRAMES, score_threshold=0.5)
     assert [p.name for p in tmp_path.iterdir()] == ["0.5"]
     _, read, _ = kitti.read_kitti(tmp_path / "0.5")
-    with_truth = np.isin(found["frame"], truth["frame"])
-    assert read["score"].size == ((found["score"] > 0.5) & with_truth).sum()
-    kitti.write_kitti(tmp_path, truth, found, frames, score_threshold=0.95)
+    with_truth = np.isin(FOUND["frame"], TRUTH["frame"])
+    assert len(read) == ((FOUND["score"] > 0.5) & with_truth).sum()
+    kitti.write_kitti(tmp_path, TRUTH, FOUND, FRAMES, score_threshold=0.95)
     lines = {p.read_text().strip() for p in (tmp_path / "0.95/all/preds").iterdir()}
     assert lines == {kitti.DUMMY}
-    _, nothing, _ = kitti.read_kitti(tmp_path / "0.95" / "all")
-    assert nothing["box"].shape == (0, 7)
+    assert len(kitti.read_kitti(tmp_path / "0.95" / "all")[1]) == 0
 
 
-def test_errors(tmp_path, scene):
-    truth, found, frames = scene
+def test_files_that_cannot_be_read_are_named(tmp_path):
     with pytest.raises(UserError, match="has no folder 'preds'"):
         kitti.read_kitti(tmp_path)
-    for cut in (0.0, 0.3):
-        kitti.write_kitti(tmp_path, truth, found, frames, score_threshold=cut)
+    for threshold in (0.0, 0.3):
+        kitti.write_kitti(tmp_path, TRUTH, FOUND, FRAMES, score_threshold=threshold)
     with pytest.raises(UserError, match=r"several score thresholds \(0.0, 0.3\)"):
         kitti.read_kitti(tmp_path)
-    strange = {**truth, "cls": np.full(len(truth["cls"]), "Tram")}
-    with pytest.raises(UserError, match="no key for class 'Tram'"):
-        kitti.write_kitti(tmp_path / "b", strange, found, frames)
     path = next((tmp_path / "0.0/all/preds").iterdir())
     start = "sed -1 -1 0 50 50 150 150 1 1"
     for text, message in (
@@ -106,20 +92,26 @@ def test_errors(tmp_path, scene):
         kitti.read_kitti(tmp_path / "0.0")
 
 
-def test_a_reports_own_files_are_written(tmp_path, scene, write_table):
-    truth, found, frames = scene
-    for name, table in (("truth", truth), ("found", found)):
-        write_table(tmp_path / f"{name}.npz", table, frames)
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"cls": np.full(30, "Tram")}, "no key for class 'Tram'"),
+        ({"frame": TRUTH["frame"] + 10**6}, r"ground truth: frame 10000.*no such frame"),
+        ({k: v[:0] for k, v in TRUTH.items()}, "no frame has ground truth"),
+    ],
+)  # fmt: skip
+def test_ground_truth_that_cannot_be_written_is_named(tmp_path, change, message):
+    with pytest.raises((DataError, UserError), match=message):
+        kitti.write_kitti(tmp_path, {**TRUTH, **change}, FOUND, FRAMES)
+
+
+def test_the_files_of_a_report_are_written(tmp_path, write_table):
+    for name, table in (("truth", TRUTH), ("found", FOUND)):
+        write_table(tmp_path / f"{name}.npz", table, FRAMES)
     by_key = [dict(np.load(tmp_path / f"{name}.npz")) for name in ("truth", "found")]
     assert by_key[0]["frame"].dtype.kind == "U"
-    count = kitti.write_kitti(tmp_path / "by_key", *by_key, frames)
-    assert count == kitti.write_kitti(tmp_path / "by_id", truth, found, frames) > 1
+    count = kitti.write_kitti(tmp_path / "by_key", *by_key, FRAMES)
+    assert count == kitti.write_kitti(tmp_path / "by_id", TRUTH, FOUND, FRAMES) > 1
     for path in (tmp_path / "by_id").rglob("*.txt"):
         other = tmp_path / "by_key" / path.relative_to(tmp_path / "by_id")
         assert path.read_text() == other.read_text()
-    wrong = {**truth, "frame": truth["frame"] + 10**6}
-    with pytest.raises(DataError, match=r"ground truth: frame 10000.*no such frame"):
-        kitti.write_kitti(tmp_path / "wrong", wrong, found, frames)
-    none = {name: column[:0] for name, column in truth.items()}
-    with pytest.raises(UserError, match="no frame has ground truth"):
-        kitti.write_kitti(tmp_path / "none", none, found, frames)
