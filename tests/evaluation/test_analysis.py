@@ -9,6 +9,8 @@ from radejax.evaluation.files import Source, load
 from radejax.evaluation.report import write_report
 from radejax.evaluation.results import ReportOptions
 
+from .scenes import random_scene
+
 CLASSES = ("Sedan", "Bus or Truck")
 
 
@@ -82,7 +84,7 @@ def test_by_time_by_hand(data):
     assert "weather" not in analysis.subsets(data, FRAMES, 0.3)
 
 
-def test_subsets_sum_to_everything(random_scene):
+def test_subsets_sum_to_everything():
     truth, found, frames = random_scene(5)
     data = EvaluationSet(truth, found, classes=CLASSES, frames=frames)
     for entries in analysis.subsets(data, frames, 0.3).values():
@@ -174,7 +176,7 @@ def test_a_correction_removes_the_warning(tmp_path):
     made = write_report(truth, wrong, frames, tmp_path, options)
     assert len(made.metrics["warnings"]) == made.text.count("WARNING: ") == 2
     right = load(tmp_path, Source(z_offset_m=-0.7, yaw_degrees=True), CLASSES)[1]
-    np.testing.assert_allclose(right["box"], found["box"])
+    np.testing.assert_allclose(right.box, found["box"])
     made = write_report(truth, right, frames, tmp_path, options)
     assert made.metrics["warnings"] == []
 

@@ -10,6 +10,9 @@ from radejax.core.errors import DataError, UserError
 from radejax.evaluation import PROTOCOLS, EvaluationSet, evaluate, mean_ap
 from radejax.evaluation.boxes import columns_of
 
+from . import reference
+from .scenes import random_scene
+
 TWO = ("Sedan", "Bus or Truck")
 METHODS = {"voc11": "VOC", "recall41": "K-Radar", "coco101": "COCO", "auc": "PR-AUC"}
 VARIANTS = {
@@ -139,15 +142,15 @@ def test_kradar_compares_boxes_with_length_and_width_swapped():
 @pytest.mark.parametrize(("z", "top"), [(0, 1 / 3), (-1.0, 1 / 3), (0.5, 0.5 / 3.5)])
 def test_kradar_r11_takes_z_as_the_top(z, top):
     data = EvaluationSet(truth_of(car(h=3.0)), found_of(car(z=z, h=1.0)))
-    assert data.overlap("swapped_lw", "3d") == pytest.approx(1 / 3)
-    assert data.overlap("swapped_lw_z_top", "3d") == pytest.approx(top)
+    assert data.overlaps("swapped_lw")["3d"] == pytest.approx(1 / 3)
+    assert data.overlaps("swapped_lw_z_top")["3d"] == pytest.approx(top)
 
 
 def test_kradar_rounds_ground_truth_only():
     data = EvaluationSet(truth_of(car(20.004)), found_of(car(20.004)))
-    assert data.overlap("plain", "bev") == pytest.approx(1.0, abs=1e-12)
+    assert data.overlaps("plain")["bev"] == pytest.approx(1.0, abs=1e-12)
     expected = np.float32((4 - 0.004) / (4 + 0.004))
-    (rounded,) = data.overlap("rounded", "bev")
+    (rounded,) = data.overlaps("rounded")["bev"]
     assert rounded == pytest.approx(float(expected), abs=1e-7)
     assert rounded == np.float32(rounded)
 
@@ -228,7 +231,7 @@ def test_golden_scenes(golden):
 
 @settings(deadline=None, max_examples=12, derandomize=True)
 @given(seed=st.integers(0, 10**6), ties=st.booleans(), data=st.data())
-def test_equals_the_slow_implementation(reference, random_scene, seed, ties, data):
+def test_equals_the_slow_implementation(seed, ties, data):
     protocol = data.draw(st.sampled_from(list(PROTOCOLS)))
     truth, found, frames = random_scene(seed, num_objects=20, ties=ties)
     terms = {"classes": TWO, "iou_thresholds": (0.2, 0.5), "frames": frames}
@@ -369,7 +372,7 @@ def test_map_fixture(shared):
 
 @settings(deadline=None, max_examples=15, derandomize=True)
 @given(seed=st.integers(0, 10**6), protocol=st.sampled_from(list(PROTOCOLS)))
-def test_ap_lies_between_0_and_100(random_scene, seed, protocol):
+def test_ap_lies_between_0_and_100(seed, protocol):
     truth, found, frames = random_scene(seed)
     for result in evaluate(truth, found, protocol=protocol, frames=frames):
         if result.is_defined:
@@ -378,9 +381,7 @@ def test_ap_lies_between_0_and_100(random_scene, seed, protocol):
 
 @settings(deadline=None, max_examples=15, derandomize=True)
 @given(seed=st.integers(0, 10**6))
-def test_perfect_predictions_are_worth_100_in_the_recommended_protocol(
-    random_scene, seed
-):
+def test_perfect_predictions_are_worth_100_in_the_recommended_protocol(seed):
     truth, _, frames = random_scene(seed)
     score = np.random.default_rng(seed).random(len(truth["frame"]))
     found = {**truth, "score": score}
@@ -396,7 +397,7 @@ def test_perfect_predictions_are_worth_100_in_the_recommended_protocol(
 
 @settings(deadline=None, max_examples=15, derandomize=True)
 @given(seed=st.integers(0, 10**6), protocol=st.sampled_from(list(PROTOCOLS)))
-def test_a_lower_scored_false_positive_never_raises_ap(random_scene, seed, protocol):
+def test_a_lower_scored_false_positive_never_raises_ap(seed, protocol):
     truth, found, frames = random_scene(seed)
     worse = {
         "frame": np.append(found["frame"], 0),
@@ -411,7 +412,7 @@ def test_a_lower_scored_false_positive_never_raises_ap(random_scene, seed, proto
 
 @settings(deadline=None, max_examples=10, derandomize=True)
 @given(seed=st.integers(0, 10**6), protocol=st.sampled_from(list(PROTOCOLS)))
-def test_the_order_of_frames_does_not_matter(random_scene, seed, protocol):
+def test_the_order_of_frames_does_not_matter(seed, protocol):
     truth, found, frames = random_scene(seed, ties=False)
     rng = np.random.default_rng(seed)
     rename = rng.permutation(len(frames["frame"]))
@@ -433,9 +434,7 @@ def test_the_order_of_frames_does_not_matter(random_scene, seed, protocol):
     shift=st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(-2, 2)),
     protocol=st.sampled_from(PLAIN),
 )
-def test_a_common_rigid_motion_does_not_matter(
-    random_scene, seed, turn, shift, protocol
-):
+def test_a_common_rigid_motion_does_not_matter(seed, turn, shift, protocol):
     truth, found, frames = random_scene(seed)
 
     def move(columns):
@@ -451,7 +450,7 @@ def test_a_common_rigid_motion_does_not_matter(
     np.testing.assert_allclose(aps(truth, found, **terms), moved, atol=1e-9)
 
 
-def test_weights_repeat_frames(random_scene):
+def test_weights_repeat_frames():
     """A frame of weight 2 counts as two equal frames, in every protocol."""
     truth, found, frames = random_scene(3, ties=False)
     weight = np.random.default_rng(0).integers(0, 3, len(frames["frame"]))
@@ -478,6 +477,12 @@ def test_weights_repeat_frames(random_scene):
 # Wrong use ------------------------------------------------------------------------------
 
 
+def found_at(**changes):
+    """Two predictions in the frames 7 and 9 of which some columns are changed."""
+    found = found_of((7, car(), "Sedan", 0.9), (9, car(), "Sedan", 0.8))
+    return {k: v for k, v in {**found, **changes}.items() if v is not None}
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -486,36 +491,40 @@ def test_weights_repeat_frames(random_scene):
         ({"empty_frames": "all"}, "empty_frames is 'all', expected one of"),
         ({"roi": "wider"}, "roi is 'wider', expected one of narrow, wide"),
         ({"roi": (0, 1, 2)}, "expected x0, x1, y0, y1"),
+        ({"roi": (0, 0, 1, 2, 3, 4)}, "with increasing bounds"),
         ({"classes": "Sedan"}, "expected different class names"),
         ({"classes": ("Sedan", "Sedan")}, "expected different class names"),
         ({"iou_thresholds": 30}, r"expected numbers in \[0, 1\)"),
+        ({"frames": {"name": ["a"]}}, r"need a column 'frame', found \['name'\]"),
+        ({"frames": {"frame": [7, 9], "weather": ["fog"]}}, "column 'weather' has"),
+        ({"frames": {"frame": [7, 9, 9]}}, "frame 9 occurs twice"),
+        ({"frames": {"frame": [9]}}, "ground truth: frame 7, row 0: no such frame"),
+        ({"ground_truth": truth_of(car(h=-1))}, r"ground truth: .* row 0: h of the.* 0$"),
+        ({"frame": None}, "predictions lack the columns.*frame"),
+        ({"score": None}, "predictions lack the columns.*score"),
+        ({"box": np.zeros((2, 8))}, r"predictions: columns .* boxes \(2, 8\)"),
+        ({"cls": np.zeros(2, int)}, "predictions: frame 7, row 0: unknown class '0'"),
+        ({"score": np.zeros(3)}, "predictions: columns of boxes differ: .* 3 scores"),
+        ({"frame": np.zeros((1, 1), int)}, "column 'frame' is int64 of shape"),
+        ({"frame": np.array([7.5, 9])}, "expected integer frame ids"),
+        ({"frame": [7, 8]}, "frame 8, row 1: no such frame among the 2 frames"),
+        ({"box": [car(), car(z=np.nan)]}, "predictions: frame 9, row 1: z .* is nan"),
+        ({"box": [car(yaw=np.inf), car()]}, "frame 7, row 0: yaw of the box is inf"),
+        ({"box": [car(), car(w=0)]}, "w of the box is 0 m, .*--invalid-sizes false_pos"),
+        ({"score": [0.9, 1.2]}, "frame 9, row 1: score 1.2 is outside"),
+        ({"score": [np.nan, 0.8]}, "frame 7, row 0: score nan is outside"),
+        ({"cls": ["Sedan", "Tram"]}, "row 1: unknown class 'Tram'; known: Sedan"),
     ],
-)
-def test_unknown_things_are_named(change, message):
-    with pytest.raises(UserError, match=message):
-        evaluate(ONE, HIT, **change)
-
-
-def test_bad_rows_are_named():
-    truth = truth_of((7, car(), "Sedan"), (9, car(), "Sedan"))
-
-    def raises(match, **changes):
-        found = found_of((7, car(), "Sedan", 0.9), (9, car(), "Sedan", 0.8)) | changes
-        with pytest.raises(DataError, match=match):
-            evaluate(truth, found, frames={"frame": np.array([7, 9])})
-
-    good = car()
-    raises(
-        "predictions: frame 9, row 1: z of the box is nan", box=[good, car(z=np.nan)]
-    )
-    raises("frame 7, row 0: yaw of the box is inf", box=[car(yaw=np.inf), good])
-    raises(
-        "w of the box is 0 m, .*--invalid-sizes false_positive", box=[good, car(w=0)]
-    )
-    raises("frame 9, row 1: score 1.2 is outside", score=[0.9, 1.2])
-    raises("frame 7, row 0: score nan is outside", score=[np.nan, 0.8])
-    raises("row 1: unknown class 'Tram'; known: Sedan", cls=["Sedan", "Tram"])
-    raises("frame 8, row 1: no such frame among the 2 frames", frame=[7, 8])
+)  # fmt: skip
+def test_wrong_arguments_and_rows_are_named(change, message):
+    terms = {
+        "ground_truth": truth_of((7, car(), "Sedan"), (9, car(), "Sedan")),
+        "frames": {"frame": np.array([7, 9])},
+    }
+    columns = {k: v for k, v in change.items() if k in HIT}
+    terms |= {k: v for k, v in change.items() if k not in HIT}
+    with pytest.raises((DataError, UserError), match=message):
+        evaluate(predictions=found_at(**columns), **terms)
 
 
 def test_far_too_many_boxes_of_a_frame_are_rejected_at_once():
@@ -525,35 +534,6 @@ def test_far_too_many_boxes_of_a_frame_are_rejected_at_once():
         evaluate(truth, found)
     half = {name: column[:500] for name, column in found.items()}  # 10**6 pairs are not
     assert EvaluationSet(truth, half).pair_gt.size == 1_000_000
-
-
-def test_ground_truth_and_frames_are_checked_too():
-    for frames, match in (
-        ({"name": ["a"]}, r"need a column 'frame', found \['name'\]"),
-        ({"frame": [0, 1], "weather": ["fog"]}, "column 'weather' has"),
-        ({"frame": [0, 3, 3]}, "frame 3 occurs twice"),
-        ({"frame": [1]}, "ground truth: frame 0, row 0: no such frame"),
-    ):
-        with pytest.raises((DataError, UserError), match=match):
-            evaluate(ONE, found_of(), frames=frames)
-    with pytest.raises(DataError, match=r"ground truth: frame 0, row 0: h of the.* 0$"):
-        evaluate(truth_of(car(h=-1)), found_of())
-
-
-def test_missing_and_misshapen_columns():
-    for column in HIT:
-        part = {k: v for k, v in HIT.items() if k != column}
-        with pytest.raises(UserError, match=f"predictions lack the columns.*{column}"):
-            evaluate(ONE, part)
-    for column, value, match in (
-        ("box", np.zeros((1, 8)), r"predictions: columns .* boxes \(1, 8\)"),
-        ("cls", np.zeros(1, int), "predictions: frame 0, row 0: unknown class '0'"),
-        ("score", np.zeros(2), "predictions: columns of boxes differ: .* 2 scores"),
-        ("frame", np.zeros((1, 1), int), "column 'frame' is int64 of shape"),
-        ("frame", np.array([0.5]), "expected integer frame ids"),
-    ):
-        with pytest.raises((DataError, UserError), match=match):
-            evaluate(ONE, {**HIT, column: value})
 
 
 def test_known_classes_that_were_not_asked_for_are_counted():

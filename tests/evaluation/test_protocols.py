@@ -5,6 +5,8 @@ from hypothesis import strategies as st
 
 from radejax.evaluation import protocols
 
+from . import reference
+
 
 def test_thresholds_by_hand():
     # 120 objects, all found: the first score is kept at c = 0, then with c = 1/40 the
@@ -18,7 +20,7 @@ def test_thresholds_by_hand():
     assert len(index) == 41
 
 
-def test_thresholds_for_every_small_count(reference):
+def test_thresholds_for_every_small_count():
     """Ties at half a step are decided by rounding: every (found, objects) must agree."""
     for num_gt in [*range(1, 130), 155, 161, 615, 999, 1000, 1001, 2047]:
         for found in {1, 2, num_gt // 3, num_gt // 2, num_gt - 1, num_gt} - {0}:
@@ -34,7 +36,7 @@ def test_thresholds_for_every_small_count(reference):
     weight=st.lists(st.integers(0, 4), min_size=1, max_size=60),
     missed=st.integers(0, 200),
 )
-def test_thresholds_of_weighted_scores(reference, weight, missed):
+def test_thresholds_of_weighted_scores(weight, missed):
     scores = np.linspace(1, 0, len(weight) + 1)[1:]
     repeated = np.repeat(scores, weight)
     num_gt = repeated.size + missed

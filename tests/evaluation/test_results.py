@@ -4,6 +4,7 @@ import pytest
 from radejax.core.errors import UserError
 from radejax.evaluation.boxes import take
 from radejax.evaluation.evaluation_set import EvaluationSet
+from radejax.evaluation.protocols import PROTOCOLS
 from radejax.evaluation.results import (
     ReportOptions,
     compute_results,
@@ -16,6 +17,8 @@ from radejax.evaluation.results import (
     sequence_weights,
 )
 
+from .scenes import random_scene
+
 CLASSES = ("Sedan", "Bus or Truck")
 OPTIONS = ReportOptions(
     classes=CLASSES,
@@ -24,16 +27,17 @@ OPTIONS = ReportOptions(
     bootstrap=20,
     protocols=("all_point",),
 )
+TRUTH, FOUND, FRAMES = random_scene(1, num_frames=60, num_objects=200, ties=False)
 
 
-@pytest.fixture
-def scene(random_scene):
-    return random_scene(1, num_frames=60, num_objects=200, ties=False)
+def results_of(frames=FRAMES, truth=TRUTH, found=FOUND, **changes):
+    options = OPTIONS.replace(**changes)
+    return compute_results(make_set(truth, found, frames, options), frames, options)
 
 
-@pytest.fixture
-def data(scene):
-    return EvaluationSet(*scene[:2], classes=CLASSES, frames=scene[2])
+def intervals(frames, **changes):
+    found = results_of(frames, **changes)
+    return {row.key[1:4]: (row.low, row.ap, row.high) for row in found}
 
 
 def test_weights_draw_whole_sequences():
@@ -51,78 +55,69 @@ def test_weights_draw_whole_sequences():
         sequence_weights(np.zeros(4), resamples=10, seed=0)
 
 
-def test_a_class_in_one_sequence_has_no_interval(scene):
-    truth, found, frames = scene
-    sequence = dict(zip(frames["frame"], frames["sequence"], strict=True))
-    number = np.array([sequence[frame] for frame in truth["frame"]])
-    is_kept = (truth["cls"] != "Sedan") | (number == number[0])
-    truth = {name: column[is_kept] for name, column in truth.items()}
-    data = EvaluationSet(truth, found, classes=CLASSES, frames=frames)
-    for row in compute_results(data, frames, OPTIONS):
-        if row.condition == "all":
-            assert np.isnan([row.low, row.high]).all() == (row.cls == "Sedan")
-
-
-def test_folders_are_named_after_options_that_change_numbers():
-    usual = {"roi": "narrow", "split": "test"}
-    changes = {"roi": "narrow", "bootstrap": 5, "kitti": True, "figures": "pdf"}
-    assert name_of_changes(changes, usual) == ""
-    changes |= {"roi": None, "classes": ("Sedan", "Bus or Truck"), "sequences": (5,)}
-    expected = "_roi_None_classes_Sedan_Bus-or-Truck_sequences_5"
-    assert name_of_changes(changes, usual) == expected
-    assert name_of_changes({"split": "/a/b c.txt"}, usual) == "_split_-a-b-c.txt"
-
-
-def test_weights_of_a_condition_give_the_condition(scene, data):
-    fog = scene[2]["weather"] == "fog"
-    for mask in (np.ones(60, bool), fog):
-        for protocol in ("all_point", "kradar_r40", "kradar_r11", "voc11", "coco101"):
-            ap = resample(data, mask[None].astype(int), protocol, "3d", 0.3)[0]
-            results = data.results(
-                protocol, iou_thresholds=0.3, spaces="3d", weights=mask
-            )
-            expected = [result.ap for result in results]
-            np.testing.assert_allclose(ap[:2], expected, rtol=0, atol=1e-12)
-            assert ap[2] == pytest.approx(ap[:2].mean())
+def test_weights_of_a_condition_give_the_condition():
+    data = EvaluationSet(TRUTH, FOUND, classes=CLASSES, frames=FRAMES)
+    fog = FRAMES["weather"] == "fog"
+    for protocol in PROTOCOLS:
+        ap = resample(data, fog[None].astype(int), protocol, "3d", 0.3)[0]
+        results = data.results(protocol, iou_thresholds=0.3, spaces="3d", weights=fog)
+        expected = [result.ap for result in results]
+        np.testing.assert_allclose(ap[:2], expected, rtol=0, atol=1e-12)
+        assert ap[2] == pytest.approx(ap[:2].mean())
     # Doubling every frame changes nothing but the rounding of recall steps.
     ap = resample(data, np.stack([fog, 2 * fog]).astype(int), "all_point", "3d", 0.3)
     np.testing.assert_allclose(ap[0], ap[1], atol=1e-9)
 
 
-def intervals(scene, frames, **changes):
-    options = OPTIONS.replace(**changes)
-    data = make_set(*scene[:2], frames, options)
-    results = compute_results(data, frames, options)
-    return {r.key[1:4]: (r.low, r.ap, r.high) for r in results}
-
-
-def test_interval_covers_the_number_and_grows_with_the_level(scene):
-    low, ap, high = intervals(scene, scene[2], bootstrap=200)["all", "Sedan", "3d"]
+def test_interval_covers_the_number():
+    low, ap, high = intervals(FRAMES, bootstrap=200)["all", "Sedan", "3d"]
     assert low < ap < high
     samples = np.arange(101.0)
     assert interval(samples) == pytest.approx((2.5, 97.5))
     assert np.isnan(interval(np.full(5, np.nan))).all()
 
 
-def test_conditions_of_one_sequence_get_no_interval(scene):
-    frames = scene[2]
-    weather = np.where(frames["sequence"] == 0, "fog", "rain")
-    found = intervals(scene, {**frames, "weather": weather})
+def test_a_class_in_one_sequence_has_no_interval():
+    number = FRAMES["sequence"][TRUTH["frame"]]
+    is_kept = (TRUTH["cls"] != "Sedan") | (number == number[0])
+    for row in results_of(truth=take(TRUTH, is_kept)):
+        if row.condition == "all":
+            assert np.isnan([row.low, row.high]).all() == (row.cls == "Sedan")
+
+
+def test_conditions_of_one_sequence_get_no_interval():
+    weather = np.where(FRAMES["sequence"] == 0, "fog", "rain")
+    found = intervals({**FRAMES, "weather": weather})
     has_interval = {key[0]: low is not None for key, (low, *_) in found.items()}
     assert has_interval == {"all": True, "fog": False, "rain": True}
     # The intervals of a condition are those of its frames evaluated as a separate dataset.
     rain = np.flatnonzero(weather == "rain")
-    part = take({**frames, "weather": weather}, rain)
-    tables = [take(table, np.isin(table["frame"], rain)) for table in scene[:2]]
-    apart = intervals(tables, part)
+    part = take({**FRAMES, "weather": weather}, rain)
+    truth, seen = (take(x, np.isin(x["frame"], rain)) for x in (TRUTH, FOUND))
+    apart = intervals(part, truth=truth, found=seen)
     for key in (k for k in found if k[0] == "rain"):
         assert found[key] == apart["all", *key[1:]]
-    whole = intervals(scene, {"frame": frames["frame"]})
+    whole = intervals({"frame": FRAMES["frame"]})
     assert all(low is None for low, *_ in whole.values())
 
 
-def test_excluded_boxes_and_frames_are_counted(random_scene):
-    truth, found, frames = random_scene(8, num_frames=30, num_objects=90)
+def test_means_are_over_classes_that_occur(scene):
+    truth, found, frames = scene  # of two of the five classes
+    rows = results_of(
+        frames, truth, found, classes=("Sedan", "Bicycle", "Bus or Truck")
+    )
+    for condition in ("all", "fog"):
+        aps = {
+            row.cls: row.ap_or_none
+            for row in rows
+            if (row.condition, row.space) == (condition, "3d")
+        }
+        assert aps["Bicycle"] is None
+        assert aps["mean"] == pytest.approx((aps["Sedan"] + aps["Bus or Truck"]) / 2)
+
+
+def test_excluded_boxes_and_frames_are_counted(scene):
+    truth, found, frames = scene
     data = EvaluationSet(truth, found, frames=frames, roi=(6, 20, -4, 4, -3, 3))
     counts = exclusion_counts(data, ReportOptions(score_threshold=0.3))
     kept = len(data.gt) + counts["ground truth: center outside the region of interest"]
@@ -136,6 +131,16 @@ def test_excluded_boxes_and_frames_are_counted(random_scene):
         above.sum() - sum(result.num_det for result in used),
     ]
     assert "predictions: score not above 0.3 (counted by all_point)" in counts
+
+
+def test_folders_are_named_after_options_that_change_numbers():
+    usual = {"roi": "narrow", "split": "test"}
+    changes = {"roi": "narrow", "bootstrap": 5, "kitti": True, "figures": "pdf"}
+    assert name_of_changes(changes, usual) == ""
+    changes |= {"roi": None, "classes": ("Sedan", "Bus or Truck"), "sequences": (5,)}
+    expected = "_roi_None_classes_Sedan_Bus-or-Truck_sequences_5"
+    assert name_of_changes(changes, usual) == expected
+    assert name_of_changes({"split": "/a/b c.txt"}, usual) == "_split_-a-b-c.txt"
 
 
 def test_conditions_are_in_the_papers_order():

@@ -1,3 +1,5 @@
+"""Published rows, and tables of a run next to them."""
+
 import collections
 import re
 
@@ -5,34 +7,31 @@ import numpy as np
 import pytest
 
 from radejax.config import config_file, load_config, load_module
-from radejax.core.structures import CLASSES, NARROW_ROI
+from radejax.core.structures import CLASSES, NARROW_ROI, Boxes
 from radejax.data.kradar import KRadar
 from radejax.evaluation import report
 from radejax.evaluation.boxes import tables_from_frames
-from radejax.evaluation.comparison import compare_files
-from radejax.evaluation.files import Source, evaluate_files
-from radejax.evaluation.report import PUBLISHED
+from radejax.evaluation.report import PUBLISHED, RunTables
 from radejax.evaluation.results import ReportOptions, compute_results, make_set
 from radejax.runs.evaluate import report_options
 
+OF_PAPERS = [row for row in PUBLISHED if ", Table " in row.source]
 
-def printed(source, method=None, *, iou=0.3):
-    """Function (class, space, condition) -> number of a row of a table, or None."""
-    row, *_ = (
-        r for r in PUBLISHED if r.source == source and method in (None, r.method)
-    )
+
+def printed(source, method=None):
+    """Function (class, space, condition) -> number of a row at IoU 0.3, or None."""
+    rows = (row for row in PUBLISHED if row.source == source)
+    row = next(row for row in rows if method in (None, row.method))
 
     def value(cls="Sedan", space="3d", condition="all"):
-        text = row.values.get((condition, cls, space, iou), "-")
+        text = row.values.get((condition, cls, space, 0.3), "-")
         return None if text == "-" else float(text)
 
     return value
 
 
-OF_PAPERS = [row for row in PUBLISHED if ", Table " in row.source]
-
-
 def test_published_file_has_all_numbers():
+    """The counts and sums are those of the file that was compared with its sources."""
     assert collections.Counter(row.source for row in OF_PAPERS) == {
         "RADE-Net, Table I": 11,
         "RADE-Net, Table II": 1,
@@ -42,63 +41,24 @@ def test_published_file_has_all_numbers():
         "DinoRADE, Table 3": 3,
         "DinoRADE, Table 4": 4,
     }
-    texts = [text for row in OF_PAPERS for text in row.values.values()]
-    values = [float(text) for text in texts if text != "-"]
-    assert (len(texts), len(values)) == (454, 385)
-    assert sum(values) == pytest.approx(19256.36, abs=1e-6)
-    assert {row.label_version for row in OF_PAPERS} == {"v1.1", "v2.1"}
+    for rows, counts, total in (
+        (OF_PAPERS, (454, 385), 19256.36),
+        ([row for row in PUBLISHED if row not in OF_PAPERS], (320, 296), 18349.95),
+    ):
+        texts = [text for row in rows for text in row.values.values()]
+        values = [float(text) for text in texts if text != "-"]
+        assert (len(texts), len(values)) == counts
+        assert sum(values) == pytest.approx(total, abs=1e-6)
+        assert all(0 <= value <= 100 for value in values)
     for row in PUBLISHED:
         assert row.protocol in ("coco101", "not stated")
         assert row.region in ("narrow", "wide", "not stated")
         assert set(row.sensors) <= set("LCR")
         assert re.fullmatch(r"[\w-]+/[\w-]+|none|not stated", row.code)
-        values = [float(text) for text in row.values.values() if text != "-"]
-        assert values
-        assert all(0 <= value <= 100 for value in values)
-
-
-def test_rows_of_other_sources_as_printed():
-    """The primary rows of section 1 of the overview of the field."""
-    found = {
-        (row.source, row.method, row.label_version, cls, space, iou): text
-        for row in PUBLISHED
-        if row not in OF_PAPERS
-        for (condition, cls, space, iou), text in row.values.items()
-        if condition == "all"
-    }
-    docs = "K-Radar, docs/"
-    for key, text in {
-        (docs + "sensor_fusion.md", "ASF", "v1.0", "Sedan", "3d", 0.3): "87.4",
-        (docs + "sensor_fusion.md", "ASF", "v2.0", "Bus or Truck", "bev", 0.3): "70.2",
-        (docs + "detection.md", "RTNH", "v1.0", "Sedan", "3d", 0.3): "47.4",
-        (docs + "detection.md", "RTNH", "v2.0", "Bus or Truck", "bev", 0.3): "45.3",
-        (docs + "labeling.md", "PVRCNN++", "v2.0", "Sedan", "bev", 0.3): "74.82",
-        ("K-Radar, issue 70", "RTNH", "not stated", "Sedan", "3d", 0.3): "37.4",
-        ("L4DR, logs/v1.1.txt", "L4DR", "v1.1", "Sedan", "bev", 0.5): "77.54",
-        ("L4DR, logs/v2.1.txt", "L4DR", "v2.1", "Bus or Truck", "3d", 0.5): "39.11",
-        ("DPFT, README.md", "DPFT", "v2.0", "Sedan", "3d", 0.3): "50.5",
-        (
-            "SRF, abstract",
-            "SRF, classes not stated",
-            "v2.0",
-            "mean",
-            "3d",
-            0.3,
-        ): "54.3",
-    }.items():
-        assert found[key] == text
-    assert len(found) == 47
-
-
-def test_rows_from_earlier_papers_say_what_labels_they_used():
-    for source in ("RADE-Net, Table I", "DinoRADE, Table 1"):
-        rows = {row.method: row for row in PUBLISHED if row.source == source}
-        for method in {"DPFT", "RTNH", "WRCFormer"} & set(rows):
-            row = rows[method]
-            assert row.label_version == "v1.1"  # as these papers print it
-            assert row.label_origin == "v1.0 in their own papers"
-            terms = "protocol not stated, labels=v1.1 (v1.0 in their own papers)"
-            assert row.terms == terms
+        if row.source in ("RADE-Net, Table I", "DinoRADE, Table 1"):
+            # These papers print v1.1 for rows of earlier papers.
+            is_earlier = row.method in ("DPFT", "RTNH", "WRCFormer")
+            assert ("labels=v1.1 (v1.0 in their own papers)" in row.terms) == is_earlier
 
 
 @pytest.mark.parametrize(
@@ -117,10 +77,9 @@ def test_a_published_row_has_a_config_or_is_not_trainable_here(row):
     assert {cls for _, cls, *_ in row.values} <= {*classes, "mean"}
     assert (config.model.name == "dinorade") == (row.sensors == "RC")
     options = report_options(config)
-    assert options.paper_protocol == row.protocol
     assert options.settings_of(row.protocol)["score_threshold"] == 0.3
-    assert row.score_threshold == "0.3"
-    assert report.roi_name(options.roi) == row.region
+    is_ablation = row.source in report.ABLATIONS
+    assert row.is_comparable(options, "test") != is_ablation
     assert {iou for *_, iou in row.values} <= set(options.iou_thresholds)
 
 
@@ -131,29 +90,13 @@ def test_the_ablation_tables_of_the_configs_are_the_published_ones(name):
     table = re.findall(r"^\| (\w+) \| ([\d.]+) \| ([\d.]+) \|$", module.__doc__, re.M)
     published = {}
     for row in PUBLISHED:
-        if row.source in ("RADE-Net, Table III", "DinoRADE, Table 4"):
-            config, _, options = row.config.partition(":")
+        config, _, options = row.config.partition(":")
+        if row.source in report.ABLATIONS and config == name:
             aps = [row.values["all", "Sedan", space, 0.3] for space in ("3d", "bev")]
-            published[config, options.split(",")[0]] = aps
-    assert {(name, v): [d3, bev] for v, d3, bev in table} == {
-        key: aps for key, aps in published.items() if key[0] == name
-    }
+            published[options.split(",")[0]] = aps
+    assert {variant: [d3, bev] for variant, d3, bev in table} == published
     unpublished = {"rcw_dinov2"} if name == "dinorade" else set()
-    assert set(module.VARIANTS) - unpublished == {variant for variant, *_ in table}
-
-
-def test_some_numbers_as_printed():
-    rade = printed("RADE-Net, Table I", "RADE-Net")
-    assert (rade(), rade(space="bev"), rade(condition="fog")) == (64.1, 68.7, 85.4)
-    two = printed("RADE-Net, Table II")
-    assert two("Bus or Truck", "bev", "heavysnow") == 85.94
-    assert two("Pedestrian", "bev", "lightsnow") is None
-    assert two("Sedan", "bev", "overcast") is None
-    assert printed("DinoRADE, Table 2")("Pedestrian", condition="fog") == 50.98
-    assert printed("DinoRADE, Table 4", "R+C*+W")(space="bev") == 72.42
-    cell = "all", "Sedan", "3d", 0.5
-    three = [row.values[cell] for row in OF_PAPERS if cell in row.values]
-    assert three == ["32.85", "27.65", "32.73", "35.31", "39.02", "37.09", "38.04"]
+    assert set(module.VARIANTS) - unpublished == published.keys()
 
 
 def test_rows_that_two_tables_share_agree():
@@ -210,18 +153,17 @@ def real(shared):
     labels = shared / "data" / "kradar" / "labels_v2_1.zip"
     truth, frames = tables_from_frames(KRadar(labels=labels, split="test"), "test")
     rng = np.random.default_rng(5)
-    box = truth["box"] + rng.normal(0, 0.2, truth["box"].shape) * [1, 1, 1, 0, 0, 0, 1]
+    box = truth.box + rng.normal(0, 0.2, truth.box.shape) * [1, 1, 1, 0, 0, 0, 1]
     score = rng.uniform(0.1, 1, len(box))
-    return truth, {**truth, "box": box, "score": score}, frames
+    return truth, Boxes(truth.frame, box, truth.cls, score), frames
 
 
 def _tables(real, split="test", **changes):
     """Rows of Tables I, II, DinoRADE's 3, III and of other methods."""
     options = AS_PAPERS.replace(**changes)
     results = compute_results(make_set(*real, options), real[2], options)
-    by_key = {row.key: row for row in results}
-    built = report.paper_tables("mine", by_key, options, split)
-    return [table.rows for table in built]
+    tables = RunTables("mine", {row.key: row for row in results}, options, split)
+    return [table.rows for table in tables.papers()]
 
 
 def _differences(rows):
@@ -231,42 +173,15 @@ def _differences(rows):
 
 def test_a_difference_is_printed_where_protocol_labels_region_and_split_agree(real):
     one, two, three, ablations, others = _tables(real)
-    assert _differences(one) == []  # of labels v1.1
-    origin = "from the authors' release"
-    terms = f"coco101, score>0.3, labels=v1.1 ({origin}), roi=narrow"
-    row = ["RADE-Net (R)", "3D", "RADE-Net, Table I", terms, "64.1", "60.7"]
-    assert row in [row[:6] for row in one]
     assert [cls for cls, _ in _differences(two)] == [
         "Sedan", "Sedan", "Bus or Truck", "Bus or Truck", "Pedestrian", "Pedestrian",
         "Motorcycle", "Bicycle", "Bicycle", "mean",
     ]  # fmt: skip
     assert len(_differences(three)) == 3
     *_, theirs, gap, _, ours = (float(row[6]) for row in three)
-    assert [row[0] for row in three[-4:-1]] == ["DinoRADE (RC)", "difference", "mine"]
-    assert [row[3].split(", ")[:3] for row in three[-2:]] == [
-        ["kradar_r40", "score>0.3", "skip=frame"],
-        ["coco101", "score>0.3", "skip=class"],
-    ]
     assert gap == pytest.approx(ours - theirs, abs=0.011)
-    assert _differences(ablations) == []
-    assert len(ablations) == 7 + 4 + 2
-    assert _differences(others) == []
-    terms = "protocol not stated, score>0.3, labels=v2.1, roi=wide"
-    source = "L4DR, logs/v2.1.txt"
-    row = [
-        "L4DR (LR)",
-        "Bus or Truck",
-        source,
-        terms,
-        "59.65",
-        "63.82",
-        "39.11",
-        "55.12",
-    ]
-    assert row in others
-    assert ["SRF, classes not stated (RC)", "mean", "SRF, abstract"] in [
-        row[:3] for row in others
-    ]
+    for rows in (one, ablations, others):  # one is of labels v1.1
+        assert _differences(rows) == []
 
 
 @pytest.mark.parametrize(
@@ -295,24 +210,3 @@ def test_sedan_of_v1_1_is_compared_with_tables_1(real):
         ["3D", "DinoRADE, Table 1"],
         ["BEV", "RADE-Net, Table I"],
     ]
-
-
-def test_simulated_frames_have_no_published_row_anywhere(random_scene, tmp_path):
-    truth, found, frames = random_scene(8, num_frames=30, num_objects=90)
-    frames["simulated"] = np.ones(30, bool)
-    options = ReportOptions(roi=None, bootstrap=20, iou_thresholds=(0.3, 0.5))
-    made = report.write_report(truth, found, frames, tmp_path, options, run="mine")
-    texts = [(tmp_path / name).read_text() for name in ("tables.md", "tables.tex")]
-    for text in (*texts, made.text):
-        assert not re.search("RADE-Net|DinoRADE|RTNH|Table", text.split("Intervals")[0])
-    titles = re.findall(r"^(?:\*\*|\\caption{)(.*)$", "\n".join(texts), re.MULTILINE)
-    assert titles
-    assert all(title.startswith("Simulated data: ") for title in titles)
-    assert all(row["name"].endswith("/simulated") for row in made.metrics["ap"])
-    assert "30 simulated frames" in made.text
-    # A report that is evaluated or compared again still says so.
-    again = evaluate_files(tmp_path, tmp_path / "b", Source(), options)
-    assert again.metrics["is_simulated"]
-    text, _ = compare_files([tmp_path, tmp_path / "b"], None, Source(), options)
-    assert text.count("Simulated data: ") == text.count("B - A") == 3
-    assert "RADE-Net" not in text
