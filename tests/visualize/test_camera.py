@@ -20,16 +20,8 @@ CALIBRATION = CameraCalibration(
 )
 IMAGE = np.zeros((72, 128, 3), np.uint8)
 BOX = [12.0, 1.0, 0.0, 4.0, 2.0, 1.0, 0.0]
-
-
-def drawn(box: list, names: tuple = ("Sedan",)):
-    """Axes of ground truth on an image."""
-    truth = Boxes.one_frame(box, names)
-    return camera.draw_camera(IMAGE, CALIBRATION, ground_truth=truth)
-
-
-def texts_of(ax) -> list[str]:
-    return [text.get_text() for text in ax.texts]
+BEHIND = [-12.0, *BOX[1:]]
+FAR = [60.0, *BOX[1:]]  # 2 of 72 pixels high
 
 
 def segments_of(ax) -> np.ndarray:
@@ -37,16 +29,41 @@ def segments_of(ax) -> np.ndarray:
     return np.array(lines[-1].get_segments())
 
 
-def test_edges_by_hand():
-    ax = drawn(BOX)
+def test_boxes_are_drawn_on_their_pixels():
+    truth = Boxes.one_frame([FAR, BOX, BEHIND], ["Sedan", "Bicycle", "Sedan"])
+    found = Boxes.one_frame([[*BOX[:6], np.pi]], ["Bus or Truck"], [0.5])
+    points_m = np.array([[10.0, 1.0, 0.5], [-10.0, 0, 0], [10.0, 90.0, 0]])
+    ax = camera.draw_camera(
+        IMAGE, CALIBRATION, ground_truth=truth, predictions=found, lidar_m=points_m
+    )
+    assert ax.get_ylim()[0] > ax.get_ylim()[1]
+    # Far boxes get no label, and boxes behind the camera are not drawn.
+    texts = {text.get_text() for text in ax.texts}
+    assert texts == {"Bicycle", "Bus or Truck 0.50"}
+    (scatter,) = ax.collections[:1]
+    # u = 64 - 100 / 10, v = 36 - 50 / 10; the others are behind the camera or beside it.
+    np.testing.assert_allclose(scatter.get_offsets(), [[53.5, 30.5]])
     segments = segments_of(ax)
     assert segments.shape == (12, 2, 2)
     # The rear face, at 10 m, spans y 0..2 and z +-0.5: 64..44 and 31..41.
     # Pixel centers are at half numbers; imshow puts them on whole ones.
     np.testing.assert_allclose(segments.reshape(-1, 2).max(0), [63.5, 40.5])
     np.testing.assert_allclose(segments.reshape(-1, 2).min(0), [43.5, 30.5])
-    assert texts_of(ax) == ["Sedan"]
-    assert ax.get_ylim()[0] > ax.get_ylim()[1]
+
+
+@pytest.mark.parametrize(("yaw", "left"), [(0.0, 63.5 - 200 / 14), (np.pi, 43.5)])
+def test_the_tinted_face_is_the_front(yaw, left):
+    truth = Boxes.one_frame([*BOX[:6], yaw], ["Sedan"])
+    ax = camera.draw_camera(IMAGE, CALIBRATION, ground_truth=truth)
+    face = ax.collections[0].get_paths()[0].vertices
+    np.testing.assert_allclose(face[:, 0].min(), left)
+
+
+def test_a_box_around_the_camera_is_cut_at_the_near_plane():
+    truth = Boxes.one_frame([0.0, 0.0, 0.0, 20.0, 2.0, 1.0, 0.0], ["Sedan"])
+    segments = segments_of(camera.draw_camera(IMAGE, CALIBRATION, ground_truth=truth))
+    assert np.isfinite(segments).all()
+    assert len(segments) == 8  # the far face and the four edges towards us
 
 
 def test_squeezed_images_are_shown_undistorted():
@@ -56,39 +73,6 @@ def test_squeezed_images_are_shown_undistorted():
         ax = camera.draw_camera(*given, title="frame")
         sizes.append([*ax.figure.get_size_inches(), *ax.get_window_extent().size])
     np.testing.assert_allclose(*sizes, rtol=1e-6)
-
-
-def test_tinted_face_is_the_front():
-    ax = drawn(BOX)
-    face = ax.collections[0].get_paths()[0].vertices
-    # The front, at 14 m: 64 - 100 * 2 / 14 .. 64.
-    np.testing.assert_allclose(face[:, 0].min(), 64 - 200 / 14 - 0.5)
-    turned = [*BOX[:6], np.pi]
-    ax = drawn(turned)
-    face = ax.collections[0].get_paths()[0].vertices
-    np.testing.assert_allclose(face[:, 0].min(), 43.5)
-
-
-def test_boxes_behind_the_camera_are_not_drawn():
-    behind = [-12.0, *BOX[1:]]
-    ax = drawn(behind)
-    assert not segments_of(ax).size
-    assert not ax.texts
-
-
-def test_box_around_the_camera_is_cut_at_the_near_plane():
-    around = [0.0, 0.0, 0.0, 20.0, 2.0, 1.0, 0.0]
-    ax = drawn(around)
-    segments = segments_of(ax)
-    assert np.isfinite(segments).all()
-    assert len(segments) == 8  # the far face and the four edges towards us
-
-
-def test_predictions_carry_scores():
-    ax = camera.draw_camera(
-        IMAGE, CALIBRATION, predictions=Boxes.one_frame(BOX, ["Bus or Truck"], [0.5])
-    )
-    assert texts_of(ax) == ["Bus or Truck 0.50"]
 
 
 def test_stereo_pair_is_rejected_with_advice():
@@ -103,28 +87,11 @@ def test_real_frame(shared):
     calibration = CameraCalibration.from_kradar(folder / "calib/common/cam_front0.yml")
     van = next(o for o in check["front0"]["objects"] if o["id"] == 101)
     center = np.array(van["xyz_lidar"]) + calibration.radar_from_lidar_m
-    box = [*center, 4.9, 1.9, 2.2, 0.0]
+    truth = Boxes.one_frame([*center, 4.9, 1.9, 2.2, 0.0], ["Bus or Truck"])
     image = np.zeros((720, 1280, 3), np.uint8)
-    ax = camera.draw_camera(
-        image, calibration, ground_truth=Boxes.one_frame(box, ["Bus or Truck"])
-    )
+    ax = camera.draw_camera(image, calibration, ground_truth=truth)
     points = segments_of(ax).reshape(-1, 2)
     low, high = points.min(0), points.max(0)
     assert (low < van["uv_raw"]).all()
     assert (high > van["uv_raw"]).all()
     assert (high - low < 200).all()
-
-
-def test_far_boxes_get_no_label():
-    far = [60.0, 1.0, 0.0, 4.0, 2.0, 1.0, 0.0]  # 2 of 72 pixels high
-    ax = drawn([far, BOX], ("Sedan", "Bicycle"))
-    assert texts_of(ax) == ["Bicycle"]
-    assert len(segments_of(ax)) == 24
-
-
-def test_lidar_points_in_the_image_are_drawn():
-    points_m = np.array([[10.0, 1.0, 0.5], [-10.0, 0, 0], [10.0, 90.0, 0]])
-    ax = camera.draw_camera(IMAGE, CALIBRATION, lidar_m=points_m)
-    (scatter,) = ax.collections
-    # u = 64 - 100 / 10, v = 36 - 50 / 10; the others are behind the camera or beside it.
-    np.testing.assert_allclose(scatter.get_offsets(), [[53.5, 30.5]])
