@@ -232,7 +232,8 @@ def sanity_checks(data: EvaluationSet) -> list[str]:
         >>> sanity_checks(data)
         []
     """
-    box, lines = data.predictions.box, list[str]()
+    lines: list[str] = []
+    box = data.predictions.box
     is_large = np.abs(box[:, 6]) > 2 * np.pi
     if is_large.any():
         lines.append(

@@ -68,7 +68,7 @@ class Result(Curve):
         roi: Name of the region of interest.
         label_version: Label revision of the ground truth, if known.
         is_simulated: Whether the frames are simulated.
-        condition: "all", or a weather.
+        condition: "all", or in reports the weather of the frames.
         low: Lower end of the 95 % bootstrap interval; None if it was not computed, NaN if
             the objects of the class are in fewer than two sequences.
         high: Upper end of this interval.
@@ -84,7 +84,7 @@ class Result(Curve):
     roi: str
     label_version: str | None
     is_simulated: bool
-    condition: str
+    condition: str = "all"
     low: float | None = None
     high: float | None = None
 
@@ -346,7 +346,6 @@ class EvaluationSet:
         score_threshold: float = 0.0,
         spaces: Sequence[str] = SPACES,
         weights: Shaped[np.ndarray, " F"] | None = None,
-        condition: str = "all",
     ) -> list[Result]:
         """Computes the results of one protocol over all frames or over weighted frames.
 
@@ -358,7 +357,6 @@ class EvaluationSet:
             spaces: See `evaluate`.
             weights: bool or int weight of every frame, such as the mask of a condition.
                 None counts every frame once.
-            condition: Name of the condition that the weights select.
 
         Raises:
             UserError: The protocol, a space, an IoU threshold or the empty-frame rule is
@@ -389,7 +387,6 @@ class EvaluationSet:
                     roi=self.roi,
                     label_version=self.label_version,
                     is_simulated=self.is_simulated,
-                    condition=condition,
                     **vars(curve),
                 )
                 results.append(result)

@@ -231,7 +231,8 @@ def report_folders(path: PathLike) -> dict[str, pathlib.Path]:
     For a folder of `radejax train --seeds`, they are those of the seeds that have one. For
     another path, it is the report of the run or the path itself, named "".
     """
-    path, end = files.as_path(path), "evaluation/predictions.npz"
+    path = files.as_path(path)
+    end = "evaluation/predictions.npz"
     found = {file.parts[-3]: file.parent for file in sorted(path.glob(f"seed*/{end}"))}
     return found or {"": path / "evaluation" if (path / end).is_file() else path}
 

@@ -156,7 +156,8 @@ def write_report(
 
 def _all_tables(metrics: Mapping[str, Any], tables: RunTables) -> list[Table]:
     """Builds the tables in the papers' layouts, of all protocols and IoUs, and of details."""
-    options, subsets = tables.options, metrics["subsets"]
+    options = tables.options
+    subsets = metrics["subsets"]
     built = []
     if not metrics["is_simulated"] and options.label_version:
         built += tables.papers()
@@ -207,7 +208,8 @@ def _draw_curves(
     from radejax.visualize.curves import draw_precision_recall
     from radejax.visualize.style import save_figure
 
-    protocol, iou = protocols.RECOMMENDED, options.iou_thresholds[0]
+    protocol = protocols.RECOMMENDED
+    iou = options.iou_thresholds[0]
     suffix = ", simulated data" if data.is_simulated else ""
     masks: dict[str, Any] = {"all": None, **condition_masks(frames, "weather")}
     settings = {"iou_thresholds": iou, **options.settings_of(protocol)}

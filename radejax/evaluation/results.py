@@ -36,6 +36,8 @@ LEVEL = 0.95
 """Confidence level of all intervals."""
 
 Region = Literal["narrow", "wide"] | tuple[float, ...] | None
+Names = Annotated[tuple[str, ...], MinLen(1)]
+Thresholds = Annotated[tuple[BelowOne, ...], MinLen(1)]
 
 
 class EvaluationOptions(Options, section="config.evaluation"):
@@ -43,14 +45,12 @@ class EvaluationOptions(Options, section="config.evaluation"):
 
     roi: Region = NARROW_ROI
     """Region of interest: x0, x1, y0, y1, z0, z1 in meters; None: everywhere."""
-    protocols: Annotated[tuple[str, ...], MinLen(1)] = (
-        *("coco101", "all_point", "kradar_r40"),
-    )
+    protocols: Names = ("coco101", "all_point", "kradar_r40")
     """Evaluation protocols, or module:Object; the first chooses the best checkpoint."""
     empty_frames: Literal["protocol", "class", "frame", "none"] = "protocol"
     """Frames that are excluded: protocol (by the protocol's own rule), class (frames
     without an object of the class), frame (frames without any object), none."""
-    iou_thresholds: Annotated[tuple[BelowOne, ...], MinLen(1)] = (0.3, 0.5)
+    iou_thresholds: Thresholds = (0.3, 0.5)
     """IoU thresholds."""
     score_threshold: Fraction = 0.3
     """Score threshold of all protocols except all_point."""
@@ -82,9 +82,9 @@ class EvaluationOptions(Options, section="config.evaluation"):
 class ReportOptions(EvaluationOptions):
     """Options of one report, which may be of boxes without a run."""
 
-    iou_thresholds: Annotated[tuple[BelowOne, ...], MinLen(1)] = (0.3, 0.5, 0.7)
+    iou_thresholds: Thresholds = (0.3, 0.5, 0.7)
     """IoU thresholds."""
-    protocols: Annotated[tuple[str, ...], MinLen(1)] = tuple(protocols.PROTOCOLS)
+    protocols: Names = tuple(protocols.PROTOCOLS)
     """Evaluation protocols."""
     score_threshold: Fraction = 0.0
     """Score threshold of all protocols except all_point."""
@@ -209,7 +209,8 @@ def compute_results(
     everything = {"all": np.ones(data.frame.size, bool)}
     for condition, mask in (everything | condition_masks(frames, "weather")).items():
         resampled = options.protocols if condition == "all" else options.main_protocols
-        part, weights = data, None
+        part = data
+        weights = None
         if sequence is not None and np.unique(sequence[mask]).size > 1:
             part = data if mask.all() else data.of_frames(mask)
             is_single = in_one_sequence(part, sequence[mask])
@@ -220,11 +221,11 @@ def compute_results(
                 protocol,
                 iou_thresholds=options.iou_thresholds,
                 weights=mask,
-                condition=condition,
                 **settings,
             )
             # The curves of all results would take much memory.
-            results = [dataclasses.replace(row, **_NO_CURVE) for row in results]
+            fields = {"condition": condition, **_NO_CURVE}
+            results = [dataclasses.replace(row, **fields) for row in results]
             for start in range(0, len(results), len(data.classes)):
                 group = results[start : start + len(data.classes)]
                 group.append(_mean(group))

@@ -358,11 +358,10 @@ class CameraCalibration(ArrayValues):
         """
         kinds = get_args(ImageKind)
         require(image in kinds, "image", image, f"one of {', '.join(kinds)}")
-        rotation, shift = self.rotation, self.translation_m
-        shift = shift - rotation @ self.radar_from_lidar_m
+        shift = self.translation_m - self.rotation @ self.radar_from_lidar_m
         distortion = self.distortion if image == "raw" else np.zeros(5)
         return Camera(
-            cam_from_ego=np.concatenate([rotation, shift[:, None]], 1),
+            cam_from_ego=np.concatenate([self.rotation, shift[:, None]], 1),
             intrinsics=self.intrinsics,
             distortion=distortion,
             max_radius=np.float64(_fold_radius(distortion)),

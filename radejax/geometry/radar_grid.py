@@ -150,7 +150,8 @@ class RadarGrid(ArrayValues):
             limit = np.pi if name.endswith("_rad") else _MAX_VALUE
             if not (np.abs(axis) <= limit).all():
                 raise ValueError(f"{name} must be finite, to {limit:g}, got {axis}")
-            steps, kind = np.diff(axis), "increasing"
+            kind = "increasing"
+            steps = np.diff(axis)
             if name != "range_m":
                 steps *= np.sign(axis[-1:] - axis[:1])
                 kind = "increasing or decreasing"
@@ -161,7 +162,8 @@ class RadarGrid(ArrayValues):
                 "elevation_rad and doppler_mps are both empty, expected at least one bin"
             )
         for name in ("fov_range_m", "fov_azimuth_rad"):
-            value, limit = getattr(self, name), np.pi if "rad" in name else _MAX_VALUE
+            value = getattr(self, name)
+            limit = np.pi if name.endswith("_rad") else _MAX_VALUE
             if not 0 < value <= limit:
                 raise ValueError(f"{name} must be positive, to {limit:g}, got {value}")
 
@@ -345,12 +347,15 @@ class RadarGrid(ArrayValues):
         # This order gives the bins of the released code. Azimuth is measured from the
         # middle of the axis, so that a point straight ahead lies exactly in the middle
         # even in float32.
-        axis, last = self.range_m, self.num_range - 1
+        axis = self.range_m
+        last = axis.size - 1
         range_bin = (range_m - float(axis[0])) * last / float(axis[-1] - axis[0])
         if not is_uniform(axis):
             range_bin = _interpolated(range_m, axis, np.arange(axis.size))
-        axis, last = self.azimuth_rad, self.num_azimuth - 1
-        span, middle = float(axis[-1] - axis[0]), float(axis[-1] + axis[0]) / 2
+        axis = self.azimuth_rad
+        last = axis.size - 1
+        span = float(axis[-1] - axis[0])
+        middle = float(axis[-1] + axis[0]) / 2
         azimuth_bin = (azimuth - middle) * last / span + last / 2
         if not is_uniform(axis):
             azimuth_bin = _interpolated(azimuth, axis, np.arange(axis.size))

@@ -390,15 +390,15 @@ def draw_slices(scene: Scene, *, range_idx: int | None = None) -> Figure:
         range_idx: Range bin of the azimuth-elevation slice, or None for the maximum over
             range.
     """
-    grid, values = scene.grid, np.asarray(scene.projection, np.float32)
+    grid = scene.grid
+    values = np.asarray(scene.projection, np.float32)
     doppler, elevation = np.split(values, [grid.num_doppler], -1)
-    azimuth_deg, range_m = np.rad2deg(grid.azimuth_rad), grid.range_m
     at_range = "max over range"
     if range_idx is not None:
         elevation = elevation[[range_idx]]
-        at_range = f"at {range_m[range_idx]:.1f} m"
-    azimuth = (azimuth_deg, "azimuth, right positive [deg]")
-    distance = (range_m, "range [m]")
+        at_range = f"at {grid.range_m[range_idx]:.1f} m"
+    azimuth = (np.rad2deg(grid.azimuth_rad), "azimuth, right positive [deg]")
+    distance = (grid.range_m, "range [m]")
     speed = (grid.doppler_mps, "Doppler (aliased) [m/s]")
     height = (np.rad2deg(grid.elevation_rad), "elevation bin value [deg]")
     axes_of = {

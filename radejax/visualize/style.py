@@ -285,7 +285,9 @@ def draw_labels(ax: Axes, labels: Sequence[Label], font_size: float = 7.5) -> No
         taken = np.concatenate([taken, box[None]])
         x, y = ax.transData.inverted().transform(center + (right, up) * offset + shift)
         ax.text(
-            *(x, y, label.text),
+            x,
+            y,
+            label.text,
             ha=align,
             va=("center", "bottom", "top")[up],
             color=label.color,
