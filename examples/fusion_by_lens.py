@@ -76,15 +76,9 @@ def evaluation_set(report, classes, roi, chosen):
     truth, found, frames, _ = load(report, Source(), classes)
     found, _ = repair_sizes(found, "false_positive")
     ids = np.asarray(frames["frame"])[chosen]
-
-    def cut(columns):
-        is_in = np.isin(columns["frame"], ids)
-        return {name: np.asarray(column)[is_in] for name, column in columns.items()}
-
+    truth, found = (boxes.take(np.isin(boxes.frame, ids)) for boxes in (truth, found))
     frames = {name: np.asarray(column)[chosen] for name, column in frames.items()}
-    data = EvaluationSet(
-        cut(truth), cut(found), classes=classes, frames=frames, roi=roi
-    )
+    data = EvaluationSet(truth, found, classes=classes, frames=frames, roi=roi)
     return data, frames["sequence"]
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from radejax.core.structures import CLASSES
-from radejax.evaluation.boxes import AnyColumns, Roi
+from radejax.evaluation.boxes import AnyBoxes, AnyColumns, Roi
 from radejax.evaluation.evaluation_set import SPACES, EvaluationSet, Result, mean_ap
 from radejax.evaluation.protocols import PROTOCOLS
 
@@ -17,8 +17,8 @@ __all__ = ["PROTOCOLS", "SPACES", "EvaluationSet", "Result", "evaluate", "mean_a
 
 
 def evaluate(
-    ground_truth: AnyColumns,
-    predictions: AnyColumns,
+    ground_truth: AnyBoxes,
+    predictions: AnyBoxes,
     *,
     classes: Sequence[str] = CLASSES,
     iou_thresholds: Sequence[float] | float = (0.3,),
@@ -33,9 +33,10 @@ def evaluate(
     """Computes the average precision per class, space and IoU threshold in one protocol.
 
     Args:
-        ground_truth: Columns frame `[N]` int, box `[N, 7]` x, y, z, l, w, h, yaw (meters,
-            radians, radar frame, full extents, z at mid-height) and cls `[N]` names. The
-            results of K-Radar's protocols depend on the order of boxes within each frame.
+        ground_truth: `Boxes`, or columns frame `[N]` int, box `[N, 7]` x, y, z, l, w, h,
+            yaw (meters, radians, radar frame, full extents, z at mid-height) and cls
+            `[N]` names. The results of K-Radar's protocols depend on the order of boxes
+            within each frame.
         predictions: The same columns and score `[M]` in [0, 1].
         classes: Classes to evaluate. `empty_frames` considers only these.
         iou_thresholds: A match needs an IoU above the threshold.

@@ -21,6 +21,7 @@ import csv
 import dataclasses
 import importlib.resources
 import itertools
+import json
 import pathlib
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -230,12 +231,7 @@ def _draw_curves(
 
 def plain(value: Any) -> Any:
     """Converts values to strict JSON: NaN and infinity become null."""
-    if isinstance(value, dict):
-        return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    is_number = not isinstance(value, float) or np.isfinite(value)
-    return value if is_number else None
+    return json.loads(json.dumps(value), parse_constant=lambda name: None)
 
 
 # Tables -------------------------------------------------------------------------------
@@ -519,6 +515,12 @@ class RunTables:
         elsewhere = [row.source for row in PUBLISHED if ", Table" not in row.source]
         tables = [
             self._layout(
+                "Sedan by weather at IoU 0.3 (layout of Table I)",
+                ["RADE-Net, Table I", "DinoRADE, Table 1"],
+                spaces,
+                conditions,
+            ),
+            self._layout(
                 "Classes by weather at IoU 0.3 (layout of Table II)",
                 ["RADE-Net, Table II", "DinoRADE, Table 2"],
                 classes,
@@ -530,23 +532,21 @@ class RunTables:
                 [{"condition": "all"}],
                 _crossed(classes, spaces),
             ),
+            self._layout(
+                "Ablations, Sedan (layout of Table III)",
+                ABLATIONS,
+                [{"cls": "Sedan"}],
+                ious,
+            ),
+            self._layout(
+                "Other methods, all weathers, as printed elsewhere",
+                elsewhere,
+                common,
+                ious,
+            ),
         ]
-        if "Sedan" not in self.options.classes:
-            return tables  # the others show sedans
-        first = self._layout(
-            "Sedan by weather at IoU 0.3 (layout of Table I)",
-            ["RADE-Net, Table I", "DinoRADE, Table 1"],
-            spaces,
-            conditions,
-        )
-        ablations = "Ablations, Sedan (layout of Table III)"
-        others = "Other methods, all weathers, as printed elsewhere"
-        return [
-            first,
-            *tables,
-            self._layout(ablations, ABLATIONS, [{"cls": "Sedan"}], ious),
-            self._layout(others, elsewhere, common, ious),
-        ]
+        # The others show sedans.
+        return tables if "Sedan" in self.options.classes else tables[1:3]
 
     def _layout(
         self,

@@ -115,12 +115,12 @@ def test_boxes_of_an_exported_folder(tmp_path):
     files.write_json(tmp_path / "frames.json", table)
     source = Source(ground_truth=str(tmp_path / "truth.json"))
     _, found, *_ = load_tables(out, source, detector.classes)
-    counts = np.bincount(found["frame"], minlength=6).tolist()
+    counts = np.bincount(found.frame, minlength=6).tolist()
     assert counts == [0, 0, 0, 0, len(expected[2]), len(expected[1])]
     _, kitti, *_ = load_tables(tmp_path / "k", source, detector.classes)
-    order, kitti_order = np.argsort(found["score"]), np.argsort(kitti["score"])
+    found, kitti = (boxes.take(np.argsort(boxes.score)) for boxes in (found, kitti))
     for name in ("frame", "box", "cls"):
-        np.testing.assert_array_equal(found[name][order], kitti[name][kitti_order])
+        np.testing.assert_array_equal(getattr(found, name), getattr(kitti, name))
     with pytest.raises(UserError, match=r"packed holds one model .* step=best"):
         load_model(tmp_path / "packed", step="best")
 
