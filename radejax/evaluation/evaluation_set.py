@@ -68,7 +68,7 @@ class Result(Curve):
         roi: Name of the region of interest.
         label_version: Label revision of the ground truth, if known.
         is_simulated: Whether the frames are simulated.
-        condition: "all", or in reports the weather of the frames.
+        condition: "all", or a weather.
         low: Lower end of the 95 % bootstrap interval; None if it was not computed, NaN if
             the objects of the class are in fewer than two sequences.
         high: Upper end of this interval.
@@ -84,7 +84,7 @@ class Result(Curve):
     roi: str
     label_version: str | None
     is_simulated: bool
-    condition: str = "all"
+    condition: str
     low: float | None = None
     high: float | None = None
 
@@ -346,6 +346,8 @@ class EvaluationSet:
         score_threshold: float = 0.0,
         spaces: Sequence[str] = SPACES,
         weights: Shaped[np.ndarray, " F"] | None = None,
+        curves: bool = True,
+        condition: str = "all",
     ) -> list[Result]:
         """Computes the results of one protocol over all frames or over weighted frames.
 
@@ -357,6 +359,9 @@ class EvaluationSet:
             spaces: See `evaluate`.
             weights: bool or int weight of every frame, such as the mask of a condition.
                 None counts every frame once.
+            curves: Whether to keep the precision, recall and score arrays, which take
+                much memory in many results.
+            condition: Name of the condition that the weights select.
 
         Raises:
             UserError: The protocol, a space, an IoU threshold or the empty-frame rule is
@@ -372,10 +377,15 @@ class EvaluationSet:
         score_threshold = float(score_threshold)
         frame_weights = self._frame_weights(empty_frames, weights)
         num_frames = (frame_weights > 0).sum(axis=0).tolist()
+        num_gt = (frame_weights * self.gt_count).sum(axis=0).tolist()
+        points = () if curves else ("precision", "recall", "score")
+        dropped = dict.fromkeys(points, np.zeros(0))
         results = []
         for space, iou in itertools.product(spaces, ious):
-            curves = self._curves(chosen, space, iou, score_threshold, frame_weights)
-            for index, curve in enumerate(curves):
+            of_classes = self._curves(
+                chosen, space, iou, score_threshold, frame_weights, num_gt
+            )
+            for index, curve in enumerate(of_classes):
                 result = Result(
                     cls=self.classes[index],
                     space=space,
@@ -387,7 +397,8 @@ class EvaluationSet:
                     roi=self.roi,
                     label_version=self.label_version,
                     is_simulated=self.is_simulated,
-                    **vars(curve),
+                    condition=condition,
+                    **(vars(curve) | dropped),
                 )
                 results.append(result)
         return results
@@ -399,10 +410,10 @@ class EvaluationSet:
         iou: float,
         threshold: float,
         weights: Int[np.ndarray, "F C"],
+        num_gt: Sequence[int],
     ) -> Iterator[Curve]:
-        """Yields the curve of each class over weighted frames."""
+        """Yields the curve of each class over weighted frames, with `num_gt` objects."""
         geometry, rule, kind = protocol.geometry, protocol.matching, protocol.curve
-        num_gt = (weights * self.gt_count).sum(axis=0).tolist()
         if rule == "kradar":
             triples = self._kradar_rankings(geometry, space, iou, threshold)
             for cls, triple in enumerate(triples):
@@ -411,7 +422,7 @@ class EvaluationSet:
             return
         rankings = self._pooled_rankings(geometry, rule, space, iou, threshold)
         for cls, (score, frame, is_tp) in enumerate(rankings):
-            weight = weights[frame, cls]
+            weight = weights[:, cls][frame]
             yield protocols.pooled_curve(score, is_tp, weight, num_gt[cls], kind)
 
     def _frame_weights(

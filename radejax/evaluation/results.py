@@ -126,8 +126,6 @@ class ReportOptions(EvaluationOptions):
         return {"score_threshold": threshold, "empty_frames": self.empty_frames}
 
 
-_NO_CURVE: dict[str, Any] = dict.fromkeys(("precision", "recall", "score"), np.zeros(0))
-
 SAME_NUMBERS = frozenset(
     ["bootstrap", "batch_size", "num_visualizations", "figures", "plots", "kitti"]
 )
@@ -221,11 +219,10 @@ def compute_results(
                 protocol,
                 iou_thresholds=options.iou_thresholds,
                 weights=mask,
+                curves=False,
+                condition=condition,
                 **settings,
             )
-            # The curves of all results would take much memory.
-            fields = {"condition": condition, **_NO_CURVE}
-            results = [dataclasses.replace(row, **fields) for row in results]
             for start in range(0, len(results), len(data.classes)):
                 group = results[start : start + len(data.classes)]
                 group.append(_mean(group))
@@ -294,7 +291,7 @@ def resample(
     settings |= {"iou_thresholds": iou, "spaces": space}
     samples = []
     for weight in weights:
-        results = data.results(protocol, weights=weight, **settings)
+        results = data.results(protocol, weights=weight, curves=False, **settings)
         samples.append([*(result.ap_or_none for result in results), mean_ap(results)])
     return np.array(samples, np.float64)  # None becomes NaN
 
