@@ -21,7 +21,7 @@ from radejax.data.cameras import CameraInputs, CameraOptions
 from radejax.data.kradar.conditions import WEATHERS
 from radejax.data.projection import encode
 from radejax.data.records import Records
-from radejax.detection.decode import decode
+from radejax.detection.decode import DecodeOptions, decode
 from radejax.geometry.boxes import bev_corners
 from radejax.geometry.camera import CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
@@ -218,10 +218,10 @@ def decoder(pre_nms):
     return functools.partial(
         decode,
         grid=MAP_GRID,
-        max_detections=pre_nms,
+        options=DecodeOptions(
+            max_detections=pre_nms, score_threshold=THRESHOLD, nms_iou=NMS_IOU
+        ),
         pre_nms=pre_nms,
-        score_threshold=THRESHOLD,
-        nms_iou=NMS_IOU,
     )
 
 

@@ -35,6 +35,7 @@ from radejax import models
 from radejax.config import load_config
 from radejax.core.structures import Batch
 from radejax.data.cameras import no_images
+from radejax.detection.decode import DecodeOptions
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.detector import detect
 from radejax.models.layers import GroupNorm
@@ -89,8 +90,8 @@ def detector(config, grid, size):
     inputs = [x for x in (batch.projection, batch.image, batch.camera) if x is not None]
     variables = jax.eval_shape(model.init, jax.random.key(0), *inputs)
     map_grid = models.map_grid(grid, model, "true")
-    options = {"max_detections": 100, "score_threshold": 0.3, "nms_iou": 0.3}
-    return functools.partial(detect, model, map_grid, options), (variables, *inputs)
+    function = functools.partial(detect, model, map_grid, DecodeOptions())
+    return function, (variables, *inputs)
 
 
 def train_step(config, grid, size):

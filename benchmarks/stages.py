@@ -108,7 +108,7 @@ def _measure(
         functools.partial(
             decode,
             grid=models.map_grid(grid, detector.model, mapping),
-            **detector.decode_options,
+            options=detector.decode_options,
         )
     )
     put = functools.partial(jax.device_put, device=device)

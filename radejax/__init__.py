@@ -22,10 +22,10 @@ if TYPE_CHECKING:  # the names for editors and type checkers
     from radejax.core.structures import Boxes as Boxes
     from radejax.core.structures import DetectionMaps as DetectionMaps
     from radejax.core.structures import Detections as Detections
-    from radejax.data.dataset import front_view as front_view
+    from radejax.data.cameras import front_view as front_view
     from radejax.data.kradar import KRadar as KRadar
-    from radejax.data.tesseract import project_file as project_file
-    from radejax.data.tesseract import read_tesseract as read_tesseract
+    from radejax.data.kradar.tesseract import project_file as project_file
+    from radejax.data.kradar.tesseract import read_tesseract as read_tesseract
     from radejax.evaluation import evaluate as evaluate
     from radejax.geometry.radar_grid import RadarGrid as RadarGrid
     from radejax.inference.detector import Detector as Detector

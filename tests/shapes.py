@@ -29,6 +29,7 @@ PACKAGES = (
     "training.step",
     "simulation",
     "inference.detector",
+    "inference.inputs",
     "inference.predict",
     "visualize",
 )

@@ -19,7 +19,7 @@ import pytest
 from radejax import models
 from radejax.core.structures import Batch
 from radejax.geometry.camera import stack_cameras
-from radejax.inference.detector import UNBOUNDED_ROI
+from radejax.inference.inputs import UNBOUNDED_ROI
 from radejax.training import distributed
 from radejax.training.step import create_state, make_train_step
 

@@ -25,7 +25,7 @@ from radejax.data.options import DataOptions
 from radejax.data.projection import project_tensor
 from radejax.data.records import preprocess
 from radejax.evaluation.evaluation_set import EvaluationSet
-from radejax.inference.detect_files import detect_files
+from radejax.inference.detect_files import detect_files, find_inputs
 from radejax.inference.detector import Detector
 from radejax.inference.export import export
 from radejax.runs import experiment
@@ -328,7 +328,8 @@ def test_own_parts_are_imported_wherever_a_run_is_opened(
     assert metrics["options"]["protocols"] == ["parts:EVERY_FRAME", "all_point"]
     assert "labels=" not in json.dumps(metrics)
     _forget()
-    found = detect_files(folder, [root], tmp_path / "boxes", score_threshold=0.0)
+    detector = Detector.from_workdir(folder, score_threshold=0.0)
+    found = detect_files(detector, find_inputs(detector, [root]), tmp_path / "boxes")
     assert found["frames"] == 4
     names = sorted(path.name for path in (tmp_path / "boxes").iterdir())
     assert names == ["1_0001.json", "1_0002.json", "2_0001.json", "2_0002.json"]

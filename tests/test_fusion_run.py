@@ -17,10 +17,12 @@ from radejax.cli.main import main
 from radejax.config import load_config, load_module
 from radejax.core.errors import DataError, UserError
 from radejax.data.cameras import require_images
+from radejax.data.kradar.radar_files import key_of
 from radejax.data.records import open_embeddings
-from radejax.inference.detect_files import detect_files, key_of
+from radejax.inference.detect_files import detect_files, find_inputs
 from radejax.inference.detector import Detector
-from radejax.inference.predict import embed_dataset, predict_dataset
+from radejax.inference.embed import embed_dataset
+from radejax.inference.predict import predict_dataset
 from radejax.inference.saved import load_model
 from radejax.models import build
 from radejax.runs import experiment
@@ -291,7 +293,7 @@ def test_frames_without_image_are_counted_and_predicted_by_radar(
     def boxes(frames):
         images = own.images(frames)
         found = predict_dataset(detector, own.records, frames, 4, images=images)
-        return {i: found["box"][found["frame"] == i] for i in range(len(frames))}
+        return {i: found.box[found.frame == i] for i in range(len(frames))}
 
     seen = boxes(frames)
     blind = [dataclasses.replace(frames[0], camera_path=None), *frames[1:]]
@@ -301,7 +303,7 @@ def test_frames_without_image_are_counted_and_predicted_by_radar(
     assert not np.array_equal(half[0], seen[0])
     np.testing.assert_allclose(half[1], seen[1], rtol=1e-4, atol=1e-4)
     radar = predict_dataset(detector, own.records, frames[:1], 4)
-    np.testing.assert_allclose(radar["box"], half[0], rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(radar.box, half[0], rtol=1e-4, atol=1e-4)
 
     own.camera = own.camera.replace(allow_missing=False)
     with pytest.raises(UserError, match="1 of 4 frames"):
@@ -319,7 +321,8 @@ def test_detect_finds_the_images_by_the_labels(from_images, tmp_path):
 
     def detect(name):
         out = tmp_path / name
-        counts = detect_files(from_images, [root], out, score_threshold=0.0)
+        detector = Detector.from_workdir(from_images, score_threshold=0.0)
+        counts = detect_files(detector, find_inputs(detector, [root]), out)
         boxes = {path.name: json.loads(path.read_text()) for path in out.iterdir()}
         assert counts["frames"] == len(boxes) == len(frames)
         assert counts["boxes"] == sum(map(len, boxes.values()))

@@ -252,8 +252,8 @@ def points(
 
     from radejax.data.kradar.folders import is_elevation_axis_up, read_grid
     from radejax.data.kradar.points import read_points, write_points
+    from radejax.data.kradar.radar_files import find_frames, sequence_folder
     from radejax.data.records import PreprocessReport
-    from radejax.inference.detect_files import find_frames, sequence_folder
 
     frames = find_frames(paths, sequence_numbers, weather)
     sources, skipped = dict[pathlib.Path, pathlib.Path](), dict[str, str]()
@@ -323,7 +323,7 @@ def embed(
     --image-backbone dinov3-vits16 --out /fast/embeddings
     """
     from radejax import models
-    from radejax.inference.predict import embed_dataset
+    from radejax.inference.embed import embed_dataset
     from radejax.models.dinorade import DinoRade
     from radejax.runs.data import located, simulate_missing
     from radejax.weights.image_backbone import load_image_backbone

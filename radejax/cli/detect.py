@@ -50,8 +50,14 @@ def detect(
     roots: tuple[str, ...],
     source: str,
     out: pathlib.Path,
+    step: Any,
+    image_backbone: str | None,
+    score_threshold: float | None,
+    nms_iou: float | None,
+    batch_size: int,
+    file_format: str,
     as_json: bool,
-    **settings: Any,
+    **found_by: Any,
 ) -> None:
     """Find boxes in every frame below the folders.
 
@@ -63,10 +69,20 @@ def detect(
 
     Example: radejax detect --workdir runs/quickstart --out boxes data/kradar/5
     """
-    from radejax.inference.detect_files import detect_files
+    from radejax.inference.detect_files import detect_files, find_inputs
 
     entry.set_up_jax()
-    count = detect_files(source, roots, out, **settings)
+    detector = radejax.Detector.from_workdir(
+        source,
+        step,
+        image_backbone=image_backbone,
+        score_threshold=score_threshold,
+        nms_iou=nms_iou,
+    )
+    inputs = find_inputs(detector, roots, **found_by)
+    count = detect_files(
+        detector, inputs, out, batch_size=batch_size, file_format=file_format
+    )
     text = f"{count['boxes']} boxes in {count['frames']} frames written to {out}"
     if count["clipped"]:
         text += f"; {count['clipped']} with a size that was clipped to be positive"

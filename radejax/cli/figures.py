@@ -186,7 +186,7 @@ def viewer_scenes(frames: Any, grid: Any, detector: Any = None) -> Iterator[Any]
             inputs = [projection]
             if detector.takes_camera and scene.camera is not None:
                 inputs += [frame.camera_path, scene.camera]
-            found = radejax.Boxes(**detector(*inputs).to_columns())
+            found = detector(*inputs).to_boxes()
             scene = dataclasses.replace(scene, predictions=found)
         yield scene
 
@@ -226,13 +226,13 @@ def demo(out: pathlib.Path, seed: int) -> None:
         (frame,) = frames
         projection = frame.read_projection(frames.grid)
         detector = radejax.Detector.from_workdir(MODEL)
-        found = radejax.Boxes(**detector(projection).to_columns())
+        found = detector(projection).to_boxes()
         scene = radejax.frame_scene(
             frame,
             projection,
             frames.grid,
             predictions=found,
-            score_threshold=detector.decode_options["score_threshold"],
+            score_threshold=detector.decode_options.score_threshold,
             roi=NARROW_ROI,
             title=f"simulated frame, seed {seed}, {frame.weather}",
         )

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -151,42 +152,33 @@ class Detections(struct.PyTreeNode):
         """Shows only the shape: padded arrays are long, and traced arrays have no values."""
         return f"Detections(boxes {getattr(self.boxes, 'shape', self.boxes)})"
 
-    @property
-    def num_clipped(self) -> Int[np.ndarray, " B"]:
-        """Number of detections per frame with an l, w or h of at most `MIN_SIZE_M`.
+    def to_boxes(self, frame: Int[np.ndarray, " B"] | None = None) -> Boxes:
+        """Returns the valid rows of all frames on the host.
 
-        `decode` clips smaller sizes to this value by default.
-        """
-        sizes = np.asarray(self.boxes)[..., 3:6]
-        is_clipped = (sizes <= np.float32(MIN_SIZE_M)).any(-1)
-        return (is_clipped & np.asarray(self.is_valid)).sum(-1)
-
-    def to_columns(self) -> dict[str, Shaped[np.ndarray, "N ..."]]:
-        """Returns the valid rows of all frames as NumPy columns for the evaluation.
+        Args:
+            frame: Index of every frame; its position in the batch if None. Frames with a
+                negative index, which pad a batch, are left out.
 
         Returns:
-            Columns "frame" `[N]` (position in the batch), "box" `[N, 7]`, "cls" `[N]`
-            (class names) and "score" `[N]`, sorted by frame, then by descending score.
+            Boxes with scores, in the order of the frames, then by descending score.
         """
-        frame, row = np.nonzero(np.asarray(self.is_valid))
-        indices = np.asarray(self.classes)[frame, row]
-        return {
-            "frame": frame,
-            "box": np.asarray(self.boxes, np.float64)[frame, row],
-            "cls": np.asarray(self.class_names, object)[indices].astype(str),
-            "score": np.asarray(self.scores, np.float64)[frame, row],
-        }
+        indices = np.arange(len(self.is_valid)) if frame is None else frame
+        is_real = (indices >= 0)[:, None] & np.asarray(self.is_valid)
+        position, row = np.nonzero(is_real)
+        cls = np.asarray(self.classes)[position, row]
+        return Boxes(
+            frame=indices[position].astype(np.int64),
+            box=np.asarray(self.boxes, np.float64)[position, row],
+            cls=np.asarray(self.class_names, object)[cls].astype(str),
+            score=np.asarray(self.scores, np.float64)[position, row],
+        )
 
     def to_list(self) -> list[list[dict[str, Any]]]:
-        """Returns a list of dictionaries per frame.
-
-        Each dictionary is one detection with the keys cls, score, x, y, z, l, w, h, yaw.
-        """
-        frames: list[list[dict[str, Any]]] = [[] for _ in range(self.is_valid.shape[0])]
-        columns = (column.tolist() for column in self.to_columns().values())
-        for frame, box, cls, score in zip(*columns, strict=True):
-            values = dict(zip(BOX_FIELDS, box, strict=True))
-            frames[frame].append({"cls": cls, "score": score, **values})
+        """Returns a list of dictionaries per frame, see `Boxes.to_list`."""
+        frames: list[list[dict[str, Any]]] = [[] for _ in range(len(self.is_valid))]
+        boxes = self.to_boxes()
+        for frame, row in zip(boxes.frame.tolist(), boxes.to_list(), strict=True):
+            frames[frame].append(row)
         return frames
 
     def to_pandas(self) -> Any:
@@ -196,9 +188,8 @@ class Detections(struct.PyTreeNode):
         """
         import pandas
 
-        columns = self.to_columns()
-        boxes = dict(zip(BOX_FIELDS, columns.pop("box").T, strict=True))
-        return pandas.DataFrame({**columns, **boxes})
+        boxes = self.to_boxes()
+        return pandas.DataFrame({"frame": boxes.frame, **boxes.fields()})
 
 
 MAX_BOX_VALUE = 1e6
@@ -214,6 +205,7 @@ class Boxes:
         box: float64 x, y, z, l, w, h, yaw in meters and radians in the radar frame.
         cls: Class names or class indices.
         score: float64 scores in [0, 1]; None for ground truth.
+        extras: Further columns by name, with one row per box.
 
     Raises:
         DataError: Columns differ in length, or a value is not finite or out of range. In
@@ -224,14 +216,20 @@ class Boxes:
     box: Float[np.ndarray, "N 7"]
     cls: Shaped[np.ndarray, " N"]
     score: Float[np.ndarray, " N"] | None = None
+    extras: Mapping[str, Shaped[np.ndarray, "N ..."]] = dataclasses.field(
+        default_factory=dict
+    )
 
     def __post_init__(self) -> None:
         count = len(self.frame)
-        score_rows = count if self.score is None else len(self.score)
-        if self.box.shape != (count, 7) or not len(self.cls) == score_rows == count:
+        num_scores = count if self.score is None else len(self.score)
+        lengths = {len(self.cls), num_scores, *map(len, self.extras.values())}
+        if self.box.shape != (count, 7) or lengths != {count}:
             raise DataError(
                 f"columns of boxes differ: {count} frames, boxes {self.box.shape}, "
-                f"{len(self.cls)} classes, {score_rows} scores; expected one row per box"
+                f"{len(self.cls)} classes, {num_scores} scores"
+                + "".join(f", {len(x)} of {name}" for name, x in self.extras.items())
+                + "; expected one row per box"
             )
         is_good = np.abs(self.box) <= MAX_BOX_VALUE  # False for NaN too
         if not is_good.all():
@@ -264,10 +262,56 @@ class Boxes:
         names = np.asarray(names, str)
         return cls(np.zeros(len(box), np.int64), box, names, score)
 
+    @classmethod
+    def from_columns(cls, columns: Mapping[str, Shaped[np.ndarray, "N ..."]]) -> Boxes:
+        """Creates boxes from the columns that `columns` returns."""
+        extras: dict[str, Any] = dict(columns)
+        known = {
+            name: extras.pop(name, None) for name in ("frame", "box", "cls", "score")
+        }
+        return cls(**known, extras=extras)
+
+    @classmethod
+    def concatenate(cls, parts: Sequence[Boxes]) -> Boxes:
+        """Returns the boxes of all parts, of which there is at least one, in their order."""
+        tables = [part.columns() for part in parts]
+        names = tables[0]
+        return cls.from_columns(
+            {name: np.concatenate([table[name] for table in tables]) for name in names}
+        )
+
     def __len__(self) -> int:
         return len(self.frame)
 
+    @property
+    def is_clipped(self) -> Bool[np.ndarray, " N"]:
+        """Mask of the boxes with an l, w or h of at most `MIN_SIZE_M`.
+
+        `decode` clips smaller sizes to this value by default.
+        """
+        return self.box[:, 3:6].min(axis=1) <= np.float32(MIN_SIZE_M)
+
     def take(self, rows: Shaped[np.ndarray, " K"]) -> Boxes:
         """Returns the boxes selected by an array of positions or a boolean mask."""
-        score = None if self.score is None else self.score[rows]
-        return Boxes(self.frame[rows], self.box[rows], self.cls[rows], score)
+        return self.from_columns(
+            {name: column[rows] for name, column in self.columns().items()}
+        )
+
+    def columns(self) -> dict[str, Shaped[np.ndarray, "N ..."]]:
+        """Returns the columns "frame", "box", "cls", "score" if there are any, and extras."""
+        columns = {"frame": self.frame, "box": self.box, "cls": self.cls}
+        if self.score is not None:
+            columns["score"] = self.score
+        return {**columns, **self.extras}
+
+    def fields(self) -> dict[str, Shaped[np.ndarray, "N ..."]]:
+        """Returns the columns cls, score, x, y, z, l, w, h, yaw and extras for tables."""
+        score = {} if self.score is None else {"score": self.score}
+        box = dict(zip(BOX_FIELDS, self.box.T, strict=True))
+        return {"cls": self.cls, **score, **box, **self.extras}
+
+    def to_list(self) -> list[dict[str, Any]]:
+        """Returns a dictionary with the `fields` of every box as Python numbers and text."""
+        fields = self.fields()
+        rows = zip(*(column.tolist() for column in fields.values()), strict=True)
+        return [dict(zip(fields, row, strict=True)) for row in rows]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -24,20 +24,20 @@ from radejax.detection.nms import rotated_nms
 from radejax.geometry.boxes import boxes7_from_8
 from radejax.geometry.radar_grid import RadarGrid
 
-Scalar = float | Float[jax.Array, ""]
+Scalar = float | Float[Array, ""]
 Roi = Real[Array, "6"] | Sequence[Scalar]
 RawYaw = Literal["nms", "always", "never"]
 
 
 class DecodeOptions(Options, section="config.decode"):
-    """Arguments of `decode` that the config can set."""
+    """Options of `decode`."""
 
     max_detections: AtLeastOne = 100
     """Rows of the output per frame."""
     score_threshold: Fraction = 0.3
     """Score threshold."""
     threshold_inclusive: bool = True
-    """Keep scores equal to the threshold."""
+    """Keep scores equal to the threshold, as in the paper; the released code does not."""
     nms_iou: Fraction = 0.3
     """NMS removes a box whose IoU with a better box is at least this."""
     per_class_nms: bool = False
@@ -46,10 +46,10 @@ class DecodeOptions(Options, section="config.decode"):
     """Region of interest: x0, x1, y0, y1, z0, z1 in meters. Boxes whose center is
     outside are removed before NMS. None: everywhere."""
     raw_yaw: RawYaw = "nms"
-    """Where the length of the regressed yaw vector scales a box: nms (in NMS only),
-    always (in the results too, as in the released evaluator), never."""
+    """Where the length of the regressed (sin, cos) vector scales length and width: nms (in
+    NMS only), always (in the results too, as in the released evaluator), never."""
     clip_sizes: bool = True
-    """Clip sizes to at least 0.01 m."""
+    """Clip sizes to at least 0.01 m; in the released code, they may be negative."""
 
     @pydantic.model_validator(mode="after")
     def _check(self) -> DecodeOptions:
@@ -96,16 +96,12 @@ class Peaks(struct.PyTreeNode):
 def decode(
     maps: DetectionMaps,
     grid: RadarGrid,
+    options: DecodeOptions,
     *,
-    max_detections: int,
-    score_threshold: Scalar,
-    nms_iou: Scalar = 0.3,
-    pre_nms: int | None = None,
+    score_threshold: Scalar | None = None,
+    nms_iou: Scalar | None = None,
     roi: Roi | None = None,
-    per_class_nms: bool = False,
-    threshold_inclusive: bool = True,
-    raw_yaw: RawYaw = "nms",
-    clip_sizes: bool = True,
+    pre_nms: int | None = None,
 ) -> Detections:
     """Decodes a batch of detection maps to boxes.
 
@@ -118,23 +114,14 @@ def decode(
         maps: Heatmap logits and box parameters in any float dtype; scores are computed
             in float32.
         grid: The grid of the maps.
-        max_detections: Number K of rows in the result, which has fewer rows if fewer
-            peaks can enter NMS.
-        score_threshold: Score that a peak must reach.
+        options: Options, which are constants under `jit`. The result has
+            K = `max_detections` rows, or fewer if fewer peaks can enter NMS.
+        score_threshold: Score that a peak must reach; may be traced, as may the next two.
+            Each replaces the value in `options` unless it is None.
         nms_iou: IoU at or above which the box with the lower score is removed.
+        roi: `[6]` region (x0, x1, y0, y1, z0, z1) in meters, including its bounds.
         pre_nms: Maximum number of peaks that enter NMS, those with the highest scores;
             2 K by default.
-        roi: `[6]` region (x0, x1, y0, y1, z0, z1) in meters, including its bounds, or
-            None to keep all boxes.
-        per_class_nms: Whether only boxes of the same class suppress each other.
-        threshold_inclusive: Whether a score equal to `score_threshold` passes, as in the
-            paper. In the released code, it does not.
-        raw_yaw: Where length and width of a box are multiplied by the length of its
-            regressed (sin, cos) vector. "nms" does so only for the overlaps in NMS,
-            "always" in the resulting boxes too, as in the released NMS and evaluator, and
-            "never" nowhere.
-        clip_sizes: Whether to clip sizes to at least `MIN_SIZE_M`. In the released code,
-            they may be negative.
 
     Returns:
         Detections by descending score; those with equal scores are ordered by range bin,
@@ -142,40 +129,45 @@ def decode(
         after NMS.
 
     Raises:
-        ValueError: The shapes of maps and grid differ, no peak may enter NMS, `roi` does
-            not have shape [6], or `raw_yaw` is unknown.
+        ValueError: The shapes of maps and grid differ, no peak may enter NMS, or `roi` does
+            not have shape [6].
 
     Examples:
         >>> grid = RadarGrid.reduced(
         ...     num_doppler=4, num_range=16, num_elevation=4, num_azimuth=8)
         >>> logits = jnp.full((1, 16, 8, 2), -9.0).at[0, 5, 3, 1].set(2.0)
         >>> maps = DetectionMaps(logits, jnp.ones((1, 16, 8, 8)))
-        >>> jitted = jax.jit(decode, static_argnames=("grid", "max_detections"))
-        >>> found = jitted(maps, grid, max_detections=4, score_threshold=0.3)
+        >>> jitted = jax.jit(decode, static_argnames=("grid", "options"))
+        >>> found = jitted(maps, grid, DecodeOptions(max_detections=4))
         >>> found.classes.tolist(), round(float(found.scores[0, 0]), 4)
         ([[1, -1, -1, -1]], 0.8808)
     """
-    if raw_yaw not in get_args(RawYaw):
-        raise ValueError(f"raw_yaw must be one of {get_args(RawYaw)}, got {raw_yaw!r}")
+    if score_threshold is None:
+        score_threshold = options.score_threshold
+    if nms_iou is None:
+        nms_iou = options.nms_iou
     peaks = find_peaks(
         maps,
         grid,
-        max_peaks=2 * max_detections if pre_nms is None else pre_nms,
+        max_peaks=2 * options.max_detections if pre_nms is None else pre_nms,
         score_threshold=score_threshold,
-        roi=roi,
-        threshold_inclusive=threshold_inclusive,
+        roi=options.roi if roi is None else roi,
+        threshold_inclusive=options.threshold_inclusive,
     )
-    least_m = MIN_SIZE_M if clip_sizes else -jnp.inf
+    least_m = MIN_SIZE_M if options.clip_sizes else -jnp.inf
     boxes = peaks.boxes.at[..., 3:6].max(least_m)
     peaks = dataclasses.replace(peaks, boxes=boxes)
     keep = suppress(
-        peaks, nms_iou, per_class=per_class_nms, normalize_yaw=raw_yaw == "never"
+        peaks,
+        nms_iou,
+        per_class=options.per_class_nms,
+        normalize_yaw=options.raw_yaw == "never",
     )
-    if raw_yaw == "always":
+    if options.raw_yaw == "always":
         length = jnp.linalg.norm(boxes[..., 6:8], axis=-1, keepdims=True)
         boxes = boxes.at[..., 3:5].multiply(length).at[..., 3:6].max(least_m)
         peaks = dataclasses.replace(peaks, boxes=boxes)
-    return _compact(peaks, keep, max_detections)
+    return _compact(peaks, keep, options.max_detections)
 
 
 def suppress(
@@ -220,8 +212,12 @@ def find_peaks(
 ) -> Peaks:
     """Returns the highest local maxima of the heatmaps with their boxes, before NMS.
 
-    Arguments and errors are those of `decode`. `max_peaks` is P, which is at most the
-    number of bins.
+    Arguments are those of `decode` and fields of `DecodeOptions`. `max_peaks` is P, which is
+    at most the number of bins.
+
+    Raises:
+        ValueError: The shapes of maps and grid differ, P is below 1, or `roi` does not have
+            shape [6].
 
     Examples:
         >>> grid = RadarGrid.reduced(

@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
+from radejax.core.structures import Array
 from radejax.geometry.rotated_iou import bev_iou
 
 Boxes = Float[jax.Array, "*batch K _"]
 Mask = Bool[jax.Array, "*batch K"]
-Threshold = float | Float[jax.Array, ""]
+Threshold = float | Float[Array, ""]
 
 
 def rotated_nms(

@@ -315,7 +315,7 @@ def write_boxes(path: PathLike, boxes: Boxes, frames: AnyColumns) -> None:
         ...     np.load(path)["frame"].tolist()
         ['1/00033_00001']
     """
-    columns: dict[str, Any] = {**columns_of_boxes(boxes)}
+    columns: dict[str, Any] = boxes.columns()
     if "name" in frames:
         position = frame_positions(boxes.frame, frame_ids(frames), str(path))
         columns["frame"] = np.array(frame_keys(frames), dtype=str)[position]

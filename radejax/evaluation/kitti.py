@@ -20,13 +20,14 @@ from __future__ import annotations
 
 import pathlib
 import re
+from collections.abc import Iterable
 
 import numpy as np
 
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike
-from radejax.core.structures import Boxes, Detections
+from radejax.core.structures import Boxes
 from radejax.evaluation import boxes
 from radejax.evaluation.boxes import AnyBoxes, AnyColumns, Columns
 
@@ -106,17 +107,20 @@ def write_kitti(
     return len(truth)
 
 
-def prediction_texts(detections: Detections) -> list[str]:
+def prediction_texts(boxes: Boxes, frames: Iterable[int]) -> list[str]:
     """Formats the predictions of each frame as one text in the format of K-Radar's tools.
 
     The texts have no final newline. A frame without detections has the line "dummy".
 
+    Args:
+        boxes: Predictions, as `Detections.to_boxes` returns them.
+        frames: Indices of the frames to format.
+
     Raises:
         UserError: K-Radar has no key for one of the classes.
     """
-    found = _lines(detections.to_columns(), scored=True)
-    num_frames = detections.is_valid.shape[0]
-    return ["\n".join(found.get(frame, [DUMMY])) for frame in range(num_frames)]
+    found = _lines(boxes.columns(), scored=True)
+    return ["\n".join(found.get(frame, [DUMMY])) for frame in frames]
 
 
 def _lines(table: Columns, *, scored: bool) -> dict[int, list[str]]:

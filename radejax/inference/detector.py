@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import dataclasses
 import functools
 import logging
-import os
-import pathlib
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
@@ -18,64 +15,39 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
-from jaxtyping import Bool, Float, Real, Shaped, UInt8
+from jaxtyping import Float, Real, Shaped
 
 from radejax import models
-from radejax.core.errors import UserError, require
-from radejax.core.files import PathLike, as_path
-from radejax.core.structures import ROIS, Array, Batch, Detections, to_float
-from radejax.data.cameras import CameraOptions, no_camera, no_images, read_left_image
-from radejax.data.kradar.reduced import (
-    RELEASES,
-    check_release,
-    is_reduced,
-    project_reduced,
-    release_of_file,
-)
-from radejax.data.kradar.tesseract import read_frame
-from radejax.data.projection import (
-    MAX_LEVEL,
-    find_problem,
-    project_jax,
-    stack_frames,
-    to_log_scale,
-)
-from radejax.detection.decode import ROI_LIMITS, decode, is_roi
-from radejax.geometry.camera import (
-    KRADAR_RADAR_FROM_LIDAR_Z_M,
-    RADAR_FROM_LIDAR_M,
-    Camera,
-    CameraCalibration,
-    stack_cameras,
-)
+from radejax.core.errors import require
+from radejax.core.files import PathLike
+from radejax.core.structures import Array, Batch, Detections, to_float
+from radejax.data.cameras import no_images
+from radejax.data.projection import project_jax, stack_frames
+from radejax.detection.decode import DecodeOptions, decode
 from radejax.geometry.radar_grid import RadarGrid
+from radejax.inference import inputs as reading
+from radejax.inference.inputs import (
+    Calibrations,
+    Frames,
+    Images,
+    InputReader,
+    Inputs,
+    Settings,
+)
 from radejax.inference.saved import SavedModel, Step, load_model, load_torch
-from radejax.models.dinorade import IMAGE_BACKBONE
 
 _log = logging.getLogger(__name__)
-
-UNBOUNDED_ROI = (-np.inf, np.inf, -np.inf, np.inf, -np.inf, np.inf)
-SETTINGS = {"score_threshold": (), "nms_iou": (), "roi": (6,)}
-"""Shapes of the arguments of `decode` that can change without recompilation."""
-
-Frames = Array | PathLike | Sequence[Array | PathLike]
-Images = Array | Sequence[Array | PathLike | None]
-Calibration = CameraCalibration | PathLike
-Calibrations = Camera | Calibration | Sequence[Camera | Calibration | None]
-
-_PATH = (str, os.PathLike)
-_KRADAR_FROM_LIDAR_M = (*RADAR_FROM_LIDAR_M[:2], KRADAR_RADAR_FROM_LIDAR_Z_M)
 
 
 def detect(
     model: nn.Module,
     grid: RadarGrid,
-    options: Mapping[str, Any],
+    options: DecodeOptions,
     variables: Any,
     frames: Real[Array, "B R A DE"] | Real[Array, "B D R E A"],
     image: Real[Array, "B _ _ _"] | None = None,
     camera: Any = None,
-    settings: Mapping[str, Array] | None = None,
+    settings: Settings | None = None,
 ) -> Detections:
     """Compute detections from a batch of radar tensors.
 
@@ -84,19 +56,19 @@ def detect(
     Args:
         model: Radar or radar-camera detector.
         grid: Grid of the model's maps, see `models.map_grid`.
-        options: Keyword arguments of `radejax.detection.decode.decode`.
+        options: Options of the decoding.
         variables: Variables of the model.
         frames: Projections as they are stored, or tesseracts in linear power.
         image: Images for a radar-camera model, or None to use the radar only.
         camera: Cameras of the images, or None without images.
-        settings: Values by the names in `SETTINGS`, which replace those in `options` and
-            may be traced.
+        settings: Values that replace those in `options`; they may be traced.
     """
     if frames.ndim == 5:
         frames = grid.measured_channels(project_jax(frames))
     inputs = (to_float(frames),) if image is None else (to_float(frames), image, camera)
     maps: Any = model.apply(variables, *inputs, train=False)
-    return decode(maps, grid, **{**options, **(settings or {})})
+    values = {} if settings is None else settings._asdict()
+    return decode(maps, grid, options, **values)
 
 
 class Detector:
@@ -147,7 +119,8 @@ class Detector:
         dtype: str | None = None,
         batch_sizes: Sequence[int] = (1, 2, 4, 8, 16, 32),
     ) -> None:
-        config = saved.config.replace(decode=_settings(score_threshold, nms_iou, roi))
+        changes = reading.check_settings(score_threshold, nms_iou, roi)
+        config = saved.config.replace(decode=changes)
         if dtype is not None:
             config = config.replace(model={"dtype": dtype})
         self.saved = dataclasses.replace(saved, config=config)
@@ -156,8 +129,9 @@ class Detector:
         self.num_frames: int = self.model.num_frames
         self.takes_camera = models.has_camera(self.model)
         self.camera_options = config.data.used_camera
+        self._reader = InputReader(self.model, self.grid, config.data)
         self.classes = tuple(config.classes)
-        self.decode_options = config.decode.to_dict()
+        self.decode_options = config.decode
         self.sharding = sharding or SingleDeviceSharding(jax.devices()[0])
         self.replicated = self.sharding
         run = self.detect_function()
@@ -181,7 +155,7 @@ class Detector:
         self._lock = threading.Lock()
         # Every process gets all detections: they are small.
         self._run = jax.jit(run, out_shardings=self.replicated)
-        self._extremes = jax.jit(_extremes, out_shardings=self.replicated)
+        self._extremes = jax.jit(reading.extremes, out_shardings=self.replicated)
 
     @classmethod
     def from_workdir(
@@ -288,49 +262,46 @@ class Detector:
             UserError: A shape, a number of images or cameras, or a setting is not as
                 expected.
         """
-        inputs: Any
+        changes = reading.check_settings(score_threshold, nms_iou, roi)
+        settings = Settings.of(self.decode_options, changes)
         is_checked = True  # the content of a batch was checked when it was created
         if isinstance(frames, Batch):
-            inputs = frames.projection, frames.image, frames.camera
+            inputs = Inputs(frames.projection, frames.image, frames.camera)
         else:
-            release = self.saved.config.data.release
-            radar = radar_batch(frames, self.grid, self.num_frames, release)
+            radar = self._reader.read_radar(frames, self.num_frames)
             if self.num_frames > 1:
-                shape = (-1, self.num_frames, *self.grid.projection_shape)
-                samples = np.moveaxis(self._projections(radar).reshape(shape), 1, 0)
-                radar = stack_frames(list(samples), self.grid.num_doppler)
+                radar = self._stacked(radar)
             else:
                 is_checked = not isinstance(radar, np.ndarray)
-            image, camera, num_radar_only = camera_batch(
-                image, camera, len(radar), self.model, self.camera_options
+            images, cameras, missing = self._reader.read_cameras(
+                image, camera, len(radar)
             )
-            inputs = radar, image, camera
+            inputs = Inputs(radar, images, cameras)
             with self._lock:
-                self.num_radar_only += num_radar_only
-        check_backbone(inputs[1], self.variables)
-        options = {**self.decode_options, **_settings(score_threshold, nms_iou, roi)}
-        options["roi"] = options["roi"] or UNBOUNDED_ROI
-        settings = {name: np.asarray(options[name], np.float32) for name in SETTINGS}
+                self.num_radar_only += missing
+        reading.check_backbone(inputs.image, self.variables)
         parts = []
         largest = self._batch_sizes[-1]
-        for start in range(0, len(inputs[0]), largest):
+        for start in range(0, len(inputs.radar), largest):
             chunk = jax.tree.map(lambda x, s=start: x[s : s + largest], inputs)
             parts.append(self._detect(chunk, settings, is_checked))
         if len(parts) == 1:
             return parts[0]
         return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
-    def _detect(self, inputs: Any, settings: Any, is_checked: bool) -> Detections:
+    def _detect(
+        self, inputs: Inputs, settings: Settings, is_checked: bool
+    ) -> Detections:
         """Detect objects in at most as many frames as the largest batch size."""
-        count = inputs[0].shape[0]
+        count = len(inputs.radar)
         size = next(size for size in self._batch_sizes if size >= count)
         inputs = jax.tree.map(lambda x: self.put(_padded(x, size)), inputs)
         # The check is awaited after the network was started, so that the device is not idle
         # meanwhile.
-        extremes = None if is_checked else self._extremes(inputs[0])
+        extremes = None if is_checked else self._extremes(inputs.radar)
         found = self._run(self.variables, *inputs, settings)
         if extremes is not None:
-            self._count_invalid(inputs[0], extremes, count)
+            self._count_invalid(inputs.radar, extremes, count)
         if jax.default_backend() == "cpu" and len(self.sharding.device_set) > 1:
             # With several batches in flight, CPU devices that share cores can fail to
             # synchronize.
@@ -339,30 +310,26 @@ class Detector:
         return found if count == size else jax.tree.map(lambda x: x[:count], found)
 
     def _count_invalid(
-        self, frames: Real[jax.Array, "B ..."], extremes: Any, count: int
+        self, frames: Real[Array, "B ..."], extremes: reading.Extremes, count: int
     ) -> None:
-        """Count invalid frames among the first `count`, and warn of the first ones.
-
-        Invalid are values that cannot be linear power or levels of a projection, see
-        `find_problem`. In uint8, every value is a valid level.
-        """
+        """Count invalid frames among the first `count`, and warn of the first ones."""
         if frames.dtype == jnp.uint8:
-            return
-        lowest, beams = jax.device_get(extremes)
-        find = functools.partial(_find_problem, frames.ndim - 1)
-        problems = map(find, lowest[:count].tolist(), beams[:count])
-        found = list(filter(None, problems))
-        if found and not self.num_invalid_frames:
+            return  # every value is a valid level
+        of_frames = jax.tree.map(lambda x: x[:count], jax.device_get(extremes))
+        problems = reading.find_problems(of_frames, are_tensors=frames.ndim == 5)
+        if problems and not self.num_invalid_frames:
             _log.warning(
                 "%d of %d frames are not linear power or its projection: %s. Their "
                 "detections are meaningless; further ones are counted in "
                 "num_invalid_frames",
-                len(found),
+                len(problems),
                 count,
-                found[0],
+                problems[0],
             )
         with self._lock:
-            self.num_invalid_frames += len(found)
+            self.num_invalid_frames += len(problems)
+
+    # Consecutive frames --------------------------------------------------------------
 
     def _projections(
         self, radar: Real[Array, "B ..."]
@@ -374,6 +341,30 @@ class Detector:
         if placed.ndim == 5:
             placed = self.grid.measured_channels(project_jax(placed))
         return np.asarray(to_float(placed))
+
+    def _stacked(self, radar: Real[Array, "BT ..."]) -> Float[np.ndarray, "B R A C"]:
+        """Compute the network input of samples, whose frames follow each other."""
+        shape = (-1, self.num_frames, *self.grid.projection_shape)
+        samples = np.moveaxis(self._projections(radar).reshape(shape), 1, 0)
+        return stack_frames(list(samples), self.grid.num_doppler)
+
+    def _samples(
+        self, frames: Frames, history: Float[np.ndarray, "T1 R A DE"] | None
+    ) -> tuple[Float[jax.Array, "B T R A DE"], Float[np.ndarray, "T1 R A DE"]]:
+        """Return the samples of consecutive frames, and the preceding ones of the next.
+
+        Args:
+            frames: Single frames as arrays or paths.
+            history: The last T - 1 projections, or None before the first frame.
+        """
+        new = self._projections(self._reader.read_radar(frames))
+        past = self.num_frames - 1
+        if history is None:
+            history = np.repeat(new[:1], past, axis=0)
+        known = np.concatenate([history, new])
+        rows = np.arange(len(new))[:, None] + np.arange(self.num_frames)
+        # Invalid frames were counted; those of arrays on a device are not counted again.
+        return jnp.asarray(known[rows]), known[-past:]
 
     def stream(self, frames: Iterable[Any], **settings: Any) -> Iterator[Detections]:
         """Yield the detections of items in order, with up to two items in flight.
@@ -401,25 +392,6 @@ class Detector:
             if len(started) > 1:
                 yield started.pop(0)
         yield from started
-
-    def _samples(
-        self, frames: Frames, history: Float[np.ndarray, "T1 R A DE"] | None
-    ) -> tuple[Float[jax.Array, "B T R A DE"], Float[np.ndarray, "T1 R A DE"]]:
-        """Return the samples of consecutive frames, and the preceding ones of the next.
-
-        Args:
-            frames: Single frames as arrays or paths.
-            history: The last T - 1 projections, or None before the first frame.
-        """
-        release = self.saved.config.data.release
-        new = self._projections(radar_batch(frames, self.grid, release=release))
-        past = self.num_frames - 1
-        if history is None:
-            history = np.repeat(new[:1], past, axis=0)
-        known = np.concatenate([history, new])
-        rows = np.arange(len(new))[:, None] + np.arange(self.num_frames)
-        # Invalid frames were counted; those of arrays on a device are not counted again.
-        return jnp.asarray(known[rows]), known[-past:]
 
     def warmup(self, *sample: Any) -> Detector:
         """Compile the model, so that the first call is fast.
@@ -482,294 +454,3 @@ def _padded(x: Shaped[Array, "b ..."], size: int) -> Shaped[Array, "{size} ..."]
     """Pad a batch to a batch size by repeating its last frame."""
     count = x.shape[0]
     return x if count == size else x[np.minimum(np.arange(size), count - 1)]
-
-
-# Inputs ------------------------------------------------------------------------------
-
-
-def _read_paths(given: Any, read: Callable[[pathlib.Path, int], np.ndarray]) -> Any:
-    """Replace paths by the arrays that they contain.
-
-    An array is returned unchanged. A path or a list becomes a list of arrays and None.
-    `read` is called with the path and its position in the list.
-    """
-    if not isinstance(given, str | os.PathLike | Sequence):
-        return given
-    entries = [given] if isinstance(given, _PATH) else given
-    return [
-        read(as_path(entry), index) if isinstance(entry, _PATH) else entry
-        for index, entry in enumerate(entries)
-    ]
-
-
-def as_numbers(values: Any, name: str) -> Any:
-    """Convert an array of any kind of real numbers to one that JAX accepts.
-
-    Args:
-        values: Array; those on a device are returned unchanged.
-        name: Name of the array for the error message.
-
-    Raises:
-        UserError: The values are masked, or are not real numbers.
-    """
-    if isinstance(values, jax.Array):
-        return values
-    if np.ma.is_masked(values):
-        count = np.ma.count_masked(values)
-        raise UserError(
-            f"{name}: {count} values are masked; fill them: array.filled(x)"
-        )
-    array = np.asarray(values)
-    if array.dtype == object:
-        with contextlib.suppress(TypeError, ValueError):
-            array = array.astype(np.float64)
-    if not (array.dtype.kind in "iu" or jnp.issubdtype(array.dtype, jnp.floating)):
-        raise UserError(f"{name}: array of {array.dtype}, expected real numbers")
-    return array.astype(array.dtype.newbyteorder("="), copy=False)
-
-
-def radar_batch(
-    frames: Frames, grid: RadarGrid, num_frames: int = 1, release: str | None = None
-) -> Real[Any, "B ..."]:
-    """Combine radar frames into one array with a leading axis B.
-
-    Args:
-        frames: Radar data: an array, a path, or a list of arrays and paths, see
-            `Detector.__call__`.
-        grid: Axes of the sensor.
-        num_frames: Number T of frames of a sample.
-        release: Form of the radar data that the model is for, `config.data.release`.
-            Arrays of projections may be of any form.
-
-    Returns:
-        Projections `[B T, R, A, D+E]` or tesseracts `[B T, D, R, E, A]`.
-
-    Raises:
-        UserError: The shape is that of no radar data, the data have another form than
-            `release`, or there is no frame.
-        DataError: A file is corrupted, or one frame of a reduced release is not as in the
-            release.
-    """
-
-    def read(path: pathlib.Path, _: int) -> np.ndarray:
-        # Records have projections of any form.
-        if path.suffix != ".npy" or path.name.startswith(("DERA_", *RELEASES)):
-            check_release(release_of_file(path), release, str(path))
-        return read_frame(path, grid)
-
-    radar = _read_paths(frames, read)
-    if isinstance(radar, list):
-        if not radar:
-            raise UserError("no frames: the list is empty")
-        radar = np.stack([_projected(frame, grid, release) for frame in radar])
-    radar = _projected(radar, grid, release)
-    shape = tuple(np.shape(radar))
-    projection, tesseract = grid.projection_shape, grid.shape_drea
-    axes, steps = ("B", ()) if num_frames == 1 else (f"B, {num_frames}", (num_frames,))
-    for frame in (projection, tesseract):
-        if shape in ((*steps, *frame), (*shape[:1], *steps, *frame)) and shape[0]:
-            if frame == tesseract:
-                check_release(None, release, "frames")
-            return radar.reshape(-1, *frame)
-    text = (
-        f"frames have shape {list(shape)}; expected projections [{axes}, R, A, D+E] = "
-        f"[{axes}, {', '.join(map(str, projection))}] or tesseracts [{axes}, D, R, E, A] = "
-        f"[{axes}, {', '.join(map(str, tesseract))}], or single frames [2, R, A, E] or "
-        "[N, 11] of a reduced release"
-    )
-    if steps:
-        text += f" of {num_frames} consecutive frames (config.data.num_frames), oldest "
-        text += "first; Detector.stream takes single frames and keeps preceding ones"
-    raise UserError(text)
-
-
-def _projected(frames: Any, grid: RadarGrid, release: str | None) -> Any:
-    """Convert an array to numbers, and frames of a reduced release to projections."""
-    array = as_numbers(frames, "frames")
-    if is_reduced(array, grid):
-        if array.shape[1] != 4:  # an error below explains points [N, 4]
-            found = "rpc" if array.ndim == 2 else "polar3d"
-            check_release(found, release, "frames")
-        return project_reduced(np.asarray(array), grid)
-    return array
-
-
-def _extremes(
-    frames: Real[jax.Array, "B ..."],
-) -> tuple[Float[jax.Array, " B"], Real[jax.Array, "B _ _"]]:
-    """Compute the smallest value of each frame, and its maximum over range (and Doppler).
-
-    The smallest value is -inf if the frame contains NaN or values below the valid ones. On
-    a CPU, the compiler's minimum and maximum can ignore NaN, but comparisons do not.
-    """
-    axes, least = tuple(range(1, frames.ndim)), -MAX_LEVEL if frames.ndim == 4 else 0
-    is_valid = (frames >= least).all(axes)
-    lowest = jnp.where(is_valid, frames.min(axes).astype(jnp.float32), -jnp.inf)
-    return lowest, frames.max(axis=1 if frames.ndim == 4 else (1, 2))
-
-
-def _find_problem(
-    num_axes: int, lowest: float, beams: Real[np.ndarray, "_ _"]
-) -> str | None:
-    """Describe why a frame of 3 axes (projection) or 4 is not valid; None if it is."""
-    beams = beams.astype(np.float64)
-    if num_axes == 3:
-        return find_problem(beams, -1.0 if np.isneginf(lowest) else 0.0)
-    with np.errstate(invalid="ignore"):  # the logarithm of a negative maximum
-        return find_problem(to_log_scale(beams), lowest)
-
-
-def camera_batch(
-    image: Images | None,
-    camera: Calibrations | None,
-    num_frames: int,
-    model: Any,
-    options: CameraOptions,
-) -> tuple[Real[Array, "B _ _ _"] | None, Camera | None, int]:
-    """Convert images and cameras to arrays, as `data.pipeline` puts them into a `Batch`.
-
-    Args:
-        image: Images `[B, H, W, 3]` uint8 (or `[H, W, 3]` for a single frame), the output
-            of `model.embed` for them, or a list with one image, path or None per frame.
-        camera: One calibration for all frames, or a list with one (or None) per frame. A
-            calibration is a `CameraCalibration`, the path of a K-Radar calibration file,
-            or a `Camera`. A batched `Camera` is also accepted.
-        num_frames: Number of frames B.
-        model: The detector; a radar-only model takes neither images nor cameras.
-        options: Options that define how calibrations are used.
-
-    Returns:
-        Images `[B, ...]` and a `Camera` with leading axes B, both None if no images are
-        given, and the number of frames that a radar-camera model predicts without an
-        image.
-
-    Raises:
-        UserError: A size or number is not as expected, only one of image and camera is
-            given, or an image is missing where that is not allowed.
-    """
-    if not models.has_camera(model):
-        if image is None and camera is None:
-            return None, None, 0
-        raise UserError("image and camera are given, but the model is radar-only")
-    if (image is None) != (camera is None):
-        raise UserError("image and camera belong together: give both or none")
-    images, cameras, has_image = None, None, np.zeros(num_frames, bool)
-    if image is not None:
-        cameras = _cameras(camera, num_frames, model, options)
-        images, has_image = _images(image, cameras, model, options.resize)
-        given = len(images), len(cameras.is_valid)
-        if given != (num_frames, num_frames):
-            raise UserError(
-                f"{given[0]} images and {given[1]} cameras for {num_frames} frames"
-            )
-        has_image = has_image & np.asarray(cameras.is_valid, bool)
-        cameras = cameras.replace(is_valid=has_image)
-    num_missing = int((~has_image).sum())
-    if num_missing and not options.allow_missing:
-        raise UserError(
-            f"{num_missing} of {num_frames} frames have no image or calibration, the "
-            f"first is frame {int(has_image.argmin())} of the batch; "
-            "config.data.camera.allow_missing=True predicts them from the radar only"
-        )
-    return images, cameras, num_missing
-
-
-def _images(
-    image: Any, cameras: Camera, model: Any, resize: bool
-) -> tuple[Real[Array, "B _ _ _"], Bool[np.ndarray, " B"]]:
-    """Return the images as one array, and a mask that is True where an image is given."""
-    sizes = ((*model.options.image.size, 3), model.feature_shape)
-    sizes_px = np.asarray(cameras.size_px, int)
-
-    def read(path: pathlib.Path, index: int) -> UInt8[np.ndarray, "H W 3"]:
-        # A wrong number of images is reported later.
-        width, height = sizes_px[min(index, len(sizes_px) - 1)]
-        return read_left_image(
-            path,
-            model.options.image.size,
-            resize=resize,
-            calibrated_size=(height, width),
-        )
-
-    image = _read_paths(image, read)
-    if isinstance(image, list):
-        has_image = np.array([one is not None for one in image])
-        empty = np.zeros(sizes[0], np.uint8)
-        if has_image.any():
-            empty = np.zeros_like(np.asarray(image[has_image.argmax()]))
-        image = np.stack([empty if one is None else one for one in image])
-    else:
-        image = as_numbers(image, "image")
-        image = image[None] if image.ndim == 3 else image
-        has_image = np.ones(len(image), bool)
-    if image.shape[1:] not in sizes:
-        expected = " or embedded ones ".join(f"[B, {str(s)[1:-1]}]" for s in sizes)
-        raise UserError(f"image has shape {list(image.shape)}, expected {expected}")
-    if image.dtype != np.uint8 and not jnp.issubdtype(image.dtype, jnp.floating):
-        raise UserError(f"image has dtype {image.dtype}, expected uint8")
-    return image, has_image
-
-
-def _cameras(
-    camera: Any, num_frames: int, model: Any, options: CameraOptions
-) -> Camera:
-    """Combine the cameras of all frames into one batched `Camera`."""
-    if isinstance(camera, Camera) and np.ndim(camera.is_valid) == 1:
-        return camera
-    if not isinstance(camera, list | tuple):
-        camera = [camera] * num_frames
-    none = no_camera(model.options.image.size)
-    cameras = [none if one is None else _one_camera(one, options) for one in camera]
-    return stack_cameras(cameras)
-
-
-def _one_camera(camera: Camera | Calibration, options: CameraOptions) -> Camera:
-    if isinstance(camera, Camera):
-        return camera
-    if not isinstance(camera, CameraCalibration):
-        path = as_path(camera)
-        camera = CameraCalibration.from_kradar(
-            path, radar_from_lidar_m=_KRADAR_FROM_LIDAR_M
-        )
-        camera.require_view_ahead(path)
-    own_m = camera.radar_from_lidar_m
-    shift_m = np.array(options.shift(own_m, own_m[2]))
-    camera = dataclasses.replace(camera, radar_from_lidar_m=shift_m)
-    return camera.camera(options.projection)
-
-
-def check_backbone(
-    image: Real[Array, "B _ _ _"] | None, variables: Mapping[str, Any]
-) -> None:
-    """Check that the variables contain the image backbone if images require it.
-
-    Args:
-        image: Images `[B, H, W, 3]`, embedded images, or None.
-        variables: Variables of the model.
-
-    Raises:
-        UserError: Images are given, and the weights of the image backbone are missing.
-    """
-    is_raw = image is not None and image.shape[-1] == 3
-    if is_raw and IMAGE_BACKBONE not in variables["params"]:
-        raise UserError(
-            "these weights are without the image backbone: give image_backbone=FOLDER "
-            "(--image-backbone FOLDER) with the weights of DINOv3, or embedded images"
-        )
-
-
-def _settings(
-    score_threshold: float | None,
-    nms_iou: float | None,
-    roi: Sequence[float] | str | None,
-) -> dict[str, Any]:
-    """Return the given values by the names in `SETTINGS`, without those that are None."""
-    given = {"score_threshold": score_threshold, "nms_iou": nms_iou}
-    settings: dict[str, Any] = {k: float(v) for k, v in given.items() if v is not None}
-    for name, value in settings.items():
-        require(0 <= value <= 1, name, value, "a number from 0 to 1")
-    if roi is not None:
-        limits = ROIS.get(roi, ()) if isinstance(roi, str) else tuple(roi)
-        require(is_roi(limits), "roi", roi, f"narrow, wide or {ROI_LIMITS}")
-        settings["roi"] = limits
-    return settings

@@ -28,7 +28,8 @@ from radejax.data.cameras import no_images
 from radejax.data.projection import project_jax
 from radejax.geometry.camera import Camera
 from radejax.inference import exported_loader
-from radejax.inference.detector import SETTINGS, Detector
+from radejax.inference.detector import Detector
+from radejax.inference.inputs import Settings
 from radejax.inference.saved import save_model
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.options import DinoRadeOptions
@@ -39,11 +40,18 @@ FORMATS = ("stablehlo", "onnx", "huggingface")
 PROGRAM_FILE = "detector.stablehlo"
 BYTECODE_FILE = "detector.mlirbc"
 OPTIONS_FILE = "compile_options.pb"
-INPUTS_FILE, OUTPUTS_FILE = "inputs.json", "outputs.json"
-_OF_PROGRAMS = (
-    *(PROGRAM_FILE, BYTECODE_FILE, OPTIONS_FILE, INPUTS_FILE, OUTPUTS_FILE),
-    *("load.py", "detector.onnx", "network.onnx"),
-)
+INPUTS_FILE = "inputs.json"
+OUTPUTS_FILE = "outputs.json"
+_OF_PROGRAMS = {
+    PROGRAM_FILE,
+    BYTECODE_FILE,
+    OPTIONS_FILE,
+    INPUTS_FILE,
+    OUTPUTS_FILE,
+    "load.py",
+    "detector.onnx",
+    "network.onnx",
+}
 _COMPILE_OPTIONS = bytes.fromhex("1a0420012801")
 """XLA's `CompileOptionsProto` for one replica and one partition."""
 
@@ -109,28 +117,21 @@ def export(
     require(is_known, "platforms", platforms, f"some of {KNOWN_PLATFORMS}")
     if half and kind != "huggingface":
         raise UserError("--half is only supported with --format huggingface")
-    require(radar_input in INPUTS, "input", radar_input, f"one of {INPUTS}")
+    shape = _radar_shape(detector, radar_input)
     folder = files.as_path(folder)
     programs: dict[str, bytes] = {}
-    grid, is_tensor = detector.grid, radar_input == "tensor"
-    expected = "projection, as config.data.num_frames of the model is above 1"
-    is_possible = detector.num_frames == 1 or not is_tensor
-    require(is_possible, "input", radar_input, expected)
-    saved = detector.saved
-    release = saved.config.data.release
-    expected = f"projection, as the model is for {release} files"
-    require(not (release and is_tensor), "input", radar_input, expected)
-    *bins, channels = grid.projection_shape
-    projection = *bins, detector.num_frames * channels
-    shape = grid.shape_drea if is_tensor else projection
     if kind == "stablehlo":
         programs = _stablehlo(detector, shape, platforms, batch_size, with_backbone)
     elif kind == "onnx":
         programs = _onnx_files(detector, shape, batch_size or 1, with_backbone)
     content = save_model(
-        saved, folder, with_backbone=with_backbone, half=half, programs=programs
+        detector.saved,
+        folder,
+        with_backbone=with_backbone,
+        half=half,
+        programs=programs,
     )
-    for name in set(_OF_PROGRAMS) - set(programs):
+    for name in _OF_PROGRAMS - set(programs):
         (folder / name).unlink(missing_ok=True)
     if kind == "stablehlo":
         files.write_text(folder / "load.py", inspect.getsource(exported_loader))
@@ -138,6 +139,21 @@ def export(
     files.write_text(folder / "README.md", _readme(detector, shape, left_out))
     num_bytes = sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
     return {"bytes": num_bytes, "left_out": left_out}
+
+
+def _radar_shape(detector: Detector, radar_input: str) -> tuple[int, ...]:
+    """Return the shape of one frame of the radar data with which a program begins."""
+    require(radar_input in INPUTS, "input", radar_input, f"one of {INPUTS}")
+    if radar_input == "projection":
+        *bins, channels = detector.grid.projection_shape
+        return (*bins, detector.num_frames * channels)
+    release = detector.saved.config.data.release
+    reason = "config.data.num_frames of the model is above 1"
+    if release:
+        reason = f"the model is for {release} files"
+    is_possible = detector.num_frames == 1 and not release
+    require(is_possible, "input", radar_input, f"projection, as {reason}")
+    return detector.grid.shape_drea
 
 
 def _readme(detector: Detector, shape: Sequence[int], left_out: Sequence[str]) -> str:
@@ -165,6 +181,10 @@ def _readme(detector: Detector, shape: Sequence[int], left_out: Sequence[str]) -
 
 def _array(*shape: Any, dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(shape, dtype)
+
+
+_SETTINGS = {"score_threshold": _array(), "nms_iou": _array(), "roi": _array(6)}
+"""Shapes of the fields of `Settings`, in their order."""
 
 
 def _exported(
@@ -241,9 +261,8 @@ def _detect(
     """Run the detector on inputs in the shapes of `_exported`, for both program formats."""
     projection, *rest = inputs
     image, camera = (rest[0], Camera(**rest[1])) if rest else (None, None)
-    given = dict(zip(SETTINGS, settings, strict=True))
     function = detector.detect_function()
-    found = function(variables, projection, image, camera, given)
+    found = function(variables, projection, image, camera, Settings(*settings))
     return {name: getattr(found, name) for name in RESULTS}
 
 
@@ -270,10 +289,9 @@ def _stablehlo(
         return _detect(detector, tree, inputs, settings)
 
     weights = {name: _array(*x.shape) for name, x in flat.items()}
-    settings = [_array(*shape) for shape in SETTINGS.values()]
     export_of = jax.export.export(jax.jit(program), platforms=tuple(platforms))
-    exported = export_of(weights, inputs, *settings)
-    names = [*sorted(weights), *_names(inputs), *SETTINGS]
+    exported = export_of(weights, inputs, *_SETTINGS.values())
+    names = [*sorted(weights), *_names(inputs), *_SETTINGS]
     kept = exported.module_kept_var_idx  # a program has only the inputs that it uses
     used = [(names[i], exported.in_avals[i]) for i in kept]
     contents = {
@@ -320,7 +338,6 @@ def _onnx_files(
     variables, shapes = _exported(detector, shape, batch_size, with_backbone)
     leaves, tree = jax.tree.flatten(shapes)
     inputs = dict(zip(_names(shapes), leaves, strict=True))
-    settings = {name: _array(*shape) for name, shape in SETTINGS.items()}
 
     def network(*arrays: jax.Array) -> list[jax.Array]:
         radar, *rest = jax.tree.unflatten(tree, arrays)
@@ -338,7 +355,7 @@ def _onnx_files(
         names = {"input_names": list(given), "output_names": list(results)}
         return to_onnx(function, list(given.values()), **names).SerializeToString()
 
-    every = inputs | settings
+    every = inputs | _SETTINGS
     outputs = jax.eval_shape(program, *every.values())
     # onnx_ir warns of every shape that is not static.
     logging.getLogger("onnx_ir").setLevel(logging.ERROR)

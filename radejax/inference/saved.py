@@ -38,13 +38,13 @@ from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.lifting import OFFICIAL_OFFSET_M
 from radejax.models.options import DinoRadeOptions, RadeNetOptions
 from radejax.models.radenet import RadeNet
-from radejax.training.checkpoints import Checkpoints
 from radejax.weights import dinorade_torch, image_backbone, radenet_torch
 from radejax.weights.convert import check_finite, read_state_dict
 
 _log = logging.getLogger(__name__)
 
-CONFIG_FILE, WEIGHTS_FILE = "config.json", "model.safetensors"
+CONFIG_FILE = "config.json"
+WEIGHTS_FILE = "model.safetensors"
 FORMAT = "radejax-2"
 
 FROZEN_BACKBONE = "sha256 of the frozen image backbone"
@@ -191,18 +191,19 @@ def save_model(
     """
     folder = files.as_path(folder)
     variables = {name: dict(tree) for name, tree in saved.variables.items()}
-    params, model = variables["params"], saved.config.model
-    image = model.image if isinstance(model, DinoRadeOptions) else None
-    is_vit = image is not None and image.kind == "vit"
-    if image is not None and is_vit and not with_backbone:
-        if IMAGE_BACKBONE in params and not image.freeze:
+    params = variables["params"]
+    model = saved.config.model
+    is_incomplete = False
+    if isinstance(model, DinoRadeOptions) and model.image.kind == "vit":
+        if IMAGE_BACKBONE in params and not (with_backbone or model.image.freeze):
             raise UserError(
                 "the image backbone was fine-tuned, so its weights are required. If it "
                 "started from DINOv3, its license restricts redistribution; otherwise "
                 "pass --with-backbone"
             )
-        params.pop(IMAGE_BACKBONE, None)
-    is_incomplete = is_vit and IMAGE_BACKBONE not in params
+        if not with_backbone:
+            params.pop(IMAGE_BACKBONE, None)
+        is_incomplete = IMAGE_BACKBONE not in params
     flat = traverse_util.flatten_dict(variables, sep="/")
     dtype = np.float16 if half else None
     arrays = {name: np.ascontiguousarray(x, dtype) for name, x in flat.items()}
@@ -225,11 +226,13 @@ def save_model(
 
 def _read_exported(folder: pathlib.Path) -> SavedModel:
     """Read a folder that `save_model` wrote."""
-    path, weights = folder / CONFIG_FILE, folder / WEIGHTS_FILE
+    path = folder / CONFIG_FILE
+    weights = folder / WEIGHTS_FILE
     content = files.read_object(path)
-    data, kind = weights.read_bytes(), content.get("format")
+    data = weights.read_bytes()
     try:
-        require(kind == FORMAT, "format", kind, repr(FORMAT))
+        found = content.get("format")
+        require(found == FORMAT, "format", found, repr(FORMAT))
         if hashlib.sha256(data).hexdigest() != content["sha256"][WEIGHTS_FILE]:
             raise DataError(
                 f"{weights} is corrupted or of another model: its sha256 differs from "
@@ -257,7 +260,8 @@ def _is_checkpoint(path: pathlib.Path) -> bool:
 def _read_checkpoint(path: pathlib.Path, step: Step) -> SavedModel:
     """Read the model of a workdir, its `checkpoints`, or one of them."""
     if _is_checkpoint(path):
-        folder, step = path.parent, int(path.name)
+        folder = path.parent
+        step = int(path.name)
     elif (path / "checkpoints").is_dir():
         folder = path / "checkpoints"
     elif any(map(_is_checkpoint, path.iterdir())):
@@ -267,6 +271,9 @@ def _read_checkpoint(path: pathlib.Path, step: Step) -> SavedModel:
             f"no model in {path}: expected {CONFIG_FILE} and {WEIGHTS_FILE}, the workdir "
             "of a run that has trained, its checkpoints, or one of them"
         )
+    # Orbax takes a second to import, and the other kinds of models do not need it.
+    from radejax.training.checkpoints import Checkpoints
+
     with Checkpoints(folder, read_only=True) as checkpoints:
         chosen = checkpoints.best_step() if step == "best" else step
         state, info, number = checkpoints.restore_variables(chosen)
@@ -286,28 +293,30 @@ def _with_backbone(saved: SavedModel, given: PathLike | None) -> SavedModel:
     They are read from the given file or folder, else from the one that the run was
     trained with, else from the weights that the run started from.
     """
-    params, data = saved.variables["params"], saved.config.data
-    is_complete = IMAGE_BACKBONE in params
-    has_camera = isinstance(saved.config.model, DinoRadeOptions)
-    if not has_camera or (is_complete and given is None):
+    params = saved.variables["params"]
+    config = saved.config
+    is_complete = IMAGE_BACKBONE in params and given is None
+    if is_complete or not isinstance(config.model, DinoRadeOptions):
         return saved
-    source, start = given or data.image_backbone, saved.run.get("init_from")
-    part: Any = {"params": {}}
+    source = given or config.data.image_backbone
+    start = saved.run.get("init_from")
+    found: Any = {"params": {}}
     if given is not None or (source and files.as_path(source).exists()):
-        part = image_backbone.load_image_backbone(source, saved.model)
-    elif start and files.as_path(start).exists() and not data.embeddings:
-        source, part = start, _fitting_variables(start, saved.config.model)
+        found = image_backbone.load_image_backbone(source, saved.model)
+    elif start and files.as_path(start).exists() and not config.data.embeddings:
+        source = start
+        found = _fitting_variables(start, config.model)
     if source is None:
         return saved
-    if IMAGE_BACKBONE not in part["params"]:
+    backbone = found["params"].get(IMAGE_BACKBONE)
+    if backbone is None:
         _log.warning(
             "image backbone weights not found at %s; the model accepts embedded images "
             "only",
             source,
         )
         return saved
-    backbone, sha256 = part["params"][IMAGE_BACKBONE], saved.run.get(FROZEN_BACKBONE)
-    if sha256 is not None:
+    if (sha256 := saved.run.get(FROZEN_BACKBONE)) is not None:
         image_backbone.check_same_backbone(backbone, sha256, source)
     params = {**params, IMAGE_BACKBONE: backbone}
     return dataclasses.replace(saved, variables={**saved.variables, "params": params})

@@ -20,7 +20,7 @@ from radejax.core.structures import Boxes
 from radejax.data.cameras import require_images
 from radejax.data.dataset import FrameSequence, LabelledFrame, find_reader
 from radejax.data.projection import decode
-from radejax.evaluation.boxes import Columns, roi_bounds, tables_from_frames, take
+from radejax.evaluation.boxes import roi_bounds, tables_from_frames
 from radejax.evaluation.evaluation_set import Result
 from radejax.evaluation.report import Report, write_report
 from radejax.evaluation.results import (
@@ -29,7 +29,8 @@ from radejax.evaluation.results import (
     make_set,
     name_of_changes,
 )
-from radejax.inference.detector import Detector, check_backbone
+from radejax.inference.detector import Detector
+from radejax.inference.inputs import check_backbone
 from radejax.inference.predict import predict_dataset
 from radejax.inference.saved import PathLike, SavedModel, Step, load_model
 from radejax.runs import figures
@@ -81,9 +82,7 @@ class Evaluation:
         placement = distributed.batch_sharding(distributed.make_mesh())
         self._detector = Detector(saved, placement, score_threshold=options.min_score)
 
-    def predict(
-        self, variables: Mapping[str, Any], **options: Any
-    ) -> dict[str, np.ndarray]:
+    def predict(self, variables: Mapping[str, Any], **options: Any) -> Boxes:
         """Detect objects in all frames of the split.
 
         Args:
@@ -91,7 +90,7 @@ class Evaluation:
             **options: Keyword arguments of `predict_dataset`.
 
         Returns:
-            Columns of the boxes whose score reaches `min_score`, see `predict_dataset`.
+            Boxes whose score reaches `min_score`, see `predict_dataset`.
         """
         return predict_dataset(
             self._detector.replace(variables=variables),
@@ -120,7 +119,7 @@ class Evaluation:
             distributed.Stopped: `should_stop` returned True.
         """
         predictions = self.predict(variables, progress=False, should_stop=should_stop)
-        data = make_set(self._truth, predictions, self._table, self._options)
+        data = make_set(self._truth, predictions.columns(), self._table, self._options)
         # Without the frame table, there are no weathers and no intervals.
         aps = named_aps(compute_results(data, {}, self._options))
         main = f"{self._config.train.best_metric}/{self._options.protocols[0]}/"
@@ -158,7 +157,11 @@ class Evaluation:
             with files.swapped_in(place) as folder:
                 files.write_json(folder / "source.json", {"step": step, **self._source})
                 report = write_report(
-                    *(self._truth, predictions, self._table, folder, self._options),
+                    self._truth,
+                    predictions.columns(),
+                    self._table,
+                    folder,
+                    self._options,
                     run=run or workdir.name,
                     left_out=self._frames.summary().counts,
                 )
@@ -183,7 +186,7 @@ class Evaluation:
 
     def _write_figures(
         self,
-        predictions: Columns,
+        predictions: Boxes,
         workdir: pathlib.Path,
         folder: pathlib.Path,
         worst: Sequence[int],
@@ -209,20 +212,21 @@ class Evaluation:
                 figure = curves.draw_training(series, losses, workdir.name + suffix)
                 save_figure(figure, folder / f"training.{ending}")
 
-    def _scene(self, predictions: Columns, index: int, **fields: Any) -> Scene:
+    def _scene(self, predictions: Boxes, index: int, **fields: Any) -> Scene:
         """Return the scene of a frame with its boxes and image.
 
         Predictions are drawn if their score reaches `config.decode.score_threshold`, the
         default of the detector.
         """
-        frame, records, found = self._frames[index], self._data.records, predictions
+        frame, records = self._frames[index], self._data.records
         threshold = self._config.decode.score_threshold
-        is_drawn = (found["frame"] == index) & (found["score"] >= threshold)
+        found = predictions.take(predictions.frame == index)
+        assert found.score is not None  # of predictions
         return figures.frame_scene(
             frame,
             decode(records[frame.key]),
             records.grid,
-            predictions=Boxes(**take(found, is_drawn)),
+            predictions=found.take(found.score >= threshold),
             roi=roi_bounds(self._options.roi),
             score_threshold=threshold,
             **fields,
@@ -234,7 +238,7 @@ class Evaluation:
         return figures.spread(candidates, count)
 
     def _figures(
-        self, predictions: Columns, indices: Sequence[int]
+        self, predictions: Boxes, indices: Sequence[int]
     ) -> Iterator[tuple[str, Figure]]:
         """Yield names and figures of frames by their positions in the split."""
         for index in indices:

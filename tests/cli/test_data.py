@@ -15,9 +15,10 @@ from radejax.cli import figures, main
 from radejax.config import Config
 from radejax.core.errors import DataError, UserError
 from radejax.data.cameras import CameraOptions
+from radejax.data.kradar.radar_files import find_frames
 from radejax.data.kradar.tesseract import read_tesseract
 from radejax.data.records import Records
-from radejax.inference.detect_files import find_frames, front_images
+from radejax.inference.detect_files import front_images
 from radejax.inference.export import export
 from radejax.inference.saved import SavedModel, save_model
 from radejax.models.options import DinoRadeOptions, ImageOptions

@@ -10,32 +10,30 @@ from hypothesis import strategies as st
 from radejax.config import load_config
 from radejax.core.structures import WIDE_ROI, DetectionMaps
 from radejax.detection import decode as D
-from radejax.geometry.boxes import boxes7_from_8
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.geometry.rotated_iou import bev_iou, iou_3d
 
 KRADAR = RadarGrid.kradar()
 OFFICIAL = {112: KRADAR.padded(8, "stretched"), 107: KRADAR.padded(1, "stretched")}
 CASES = ("padded_wide_roi", "padded_no_roi", "unpadded_wide_roi", "unpadded_no_roi")
 GRID = RadarGrid.reduced(num_doppler=4, num_range=20, num_elevation=4, num_azimuth=12)
 C = 3
-SIZES = ("grid", "max_detections", "pre_nms", "per_class_nms")
-FLAGS = ("threshold_inclusive", "raw_yaw", "clip_sizes")
-RELEASED = {"threshold_inclusive": False}
+RELEASED = D.DecodeOptions(max_detections=16, threshold_inclusive=False)
 
-_decode = jax.jit(D.decode, static_argnames=SIZES + FLAGS)
+_decode = jax.jit(D.decode, static_argnames=("grid", "options", "pre_nms"))
 _find_peaks = jax.jit(
     D.find_peaks, static_argnames=("grid", "max_peaks", "threshold_inclusive")
 )
 
 
-def decode(*args, **options):
+def decode(maps, grid, *, roi=None, pre_nms=None, **options):
     """Results in NumPy: JAX compiles every slice of another size."""
-    return jax.device_get(_decode(*args, **RELEASED | options))
+    options = RELEASED.replace(**options)
+    return jax.device_get(_decode(maps, grid, options, roi=roi, pre_nms=pre_nms))
 
 
 def find_peaks(*args, **options):
-    return jax.device_get(_find_peaks(*args, **RELEASED | options))
+    options = {"threshold_inclusive": False, "score_threshold": 0.3} | options
+    return jax.device_get(_find_peaks(*args, **options))
 
 
 def logit(p):
@@ -92,7 +90,7 @@ def roi_of(want):
 
 def test_boxes_before_nms_of_the_released_code(case):
     _, want, maps, grid = case
-    peaks = find_peaks(maps, grid, max_peaks=96, score_threshold=0.3, roi=roi_of(want))
+    peaks = find_peaks(maps, grid, max_peaks=96, roi=roi_of(want))
     for frame in range(3):
         boxes = want[f"boxes_before_nms_{frame}"]
         boxes = boxes[np.argsort(-boxes[:, 8])]
@@ -107,7 +105,7 @@ def test_boxes_before_nms_of_the_released_code(case):
 
 def test_detections_of_the_released_code(case):
     _, want, maps, grid = case
-    found = decode(maps, grid, max_detections=48, score_threshold=0.3, roi=roi_of(want))
+    found = decode(maps, grid, max_detections=48, roi=roi_of(want))
     for frame in range(3):
         before = want[f"boxes_before_nms_{frame}"]
         kept = before[want[f"kept_{frame}"]]
@@ -137,7 +135,7 @@ def test_ties_of_the_released_code(golden):
     params = np.zeros((1, 8, 256, 112))
     params[:, 3:5], params[:, [5, 7]] = 0.2, 1
     maps = make_maps(heatmap, params)
-    peaks = find_peaks(maps, OFFICIAL[112], max_peaks=8, score_threshold=0.3)
+    peaks = find_peaks(maps, OFFICIAL[112], max_peaks=8)
     boxes = want["boxes_before_nms"]
     order = np.lexsort((boxes[:, 10], boxes[:, 11], -boxes[:, 8]))
     np.testing.assert_allclose(peaks.boxes[0, :4], boxes[order, :8], atol=2e-5)
@@ -211,7 +209,6 @@ def maps_of(logits, params):
 
 def decode_scene(logits, params, **options):
     """Detections of a scene on the small grid."""
-    options = {"max_detections": 16, "score_threshold": 0.3} | options
     return decode(maps_of(logits, params), GRID, **options)
 
 
@@ -258,14 +255,6 @@ def test_boxes_dropped_by_nms_are_not_counted_as_cut():
     assert int(few.num_truncated[0]) == 3
 
 
-def test_more_rows_than_bins():
-    logits, params, _, _ = scattered()
-    found = decode_scene(logits, params, max_detections=300)
-    assert found.boxes.shape == (1, GRID.num_range * GRID.num_azimuth, 7)
-    assert found.classes[0, -1] == -1
-    assert int(found.is_valid.sum()) == 6
-
-
 def test_region_bounds_are_inclusive_and_leave_room_for_others():
     logits, params, cells, _ = scattered(num=10)
     x, y = GRID.bin_to_ego(*cells.T).T
@@ -275,8 +264,8 @@ def test_region_bounds_are_inclusive_and_leave_room_for_others():
     found = decode_scene(logits, params, roi=roi)
     np.testing.assert_allclose(found.boxes[0, : inside.sum(), 0], x[inside], rtol=1e-6)
     # Peaks outside do not take the place of peaks inside.
-    options = {"max_peaks": int(inside.sum()), "score_threshold": 0.3, "roi": roi}
-    tight = find_peaks(maps_of(logits, params), GRID, **options)
+    count = int(inside.sum())
+    tight = find_peaks(maps_of(logits, params), GRID, max_peaks=count, roi=roi)
     assert np.asarray(tight.is_valid).all()
     params[..., 2] = 0.1
     above = decode_scene(logits, params, roi=roi)
@@ -314,11 +303,11 @@ def test_length_of_the_yaw_vector_scales_boxes_in_nms_only_as_released():
 def test_official_preset_decodes_as_released(case):
     """Region filter before NMS and boxes as the released evaluator takes them."""
     _, want, maps, grid = case
-    config = load_config("configs/radenet.py:official").decode
-    options = dict(config) | {"max_detections": 48}
+    options = load_config("configs/radenet.py:official").decode
+    options = options.replace(max_detections=48)
     if not want["wide_roi"]:
-        options["roi"] = None
-    found = decode(maps, grid, **options)
+        options = options.replace(roi=None)
+    found = jax.device_get(_decode(maps, grid, options))
     for frame in range(3):
         kept = want[f"boxes_before_nms_{frame}"][want[f"kept_{frame}"]]
         norm = np.hypot(kept[:, 6], kept[:, 7])[:, None]
@@ -329,36 +318,29 @@ def test_official_preset_decodes_as_released(case):
         np.testing.assert_allclose(boxes[:, 5], kept[:, 5], atol=2e-5)
 
 
-def test_our_evaluator_takes_the_raw_footprint_as_the_released_one(shared):
-    pairs = np.load(shared / "fixtures" / "iou" / "rotated_iou.npz")
-    mine = pairs["kind"] == "unnormalised_yaw"
-    assert mine.sum() == 20
-    raw = [pairs[key][mine].astype(float) for key in ("box_a", "box_b")]
-    for boxes in raw:
-        boxes[:, 3:5] *= np.hypot(boxes[:, 6], boxes[:, 7])[:, None]
-    a, b = map(boxes7_from_8, raw)
-    for iou, key in ((bev_iou, "iou_bev"), (iou_3d, "iou_3d")):
-        found = iou(a[:, None], b[:, None])[:, 0, 0]
-        np.testing.assert_allclose(found, pairs[key][mine], atol=5e-4)
-
-
 def test_thresholds_and_region_are_traced_values():
     logits, params, _, _ = scattered(num=10)
     count = _decode._cache_size()
     for threshold, nms_iou in ((0.3, 0.3), (0.8, 0.5), (0.5, 0.1)):
         roi = np.array([0.0, 100 * threshold, -50, 50, -1, 1])
-        options = {"score_threshold": threshold, "nms_iou": nms_iou, "roi": roi}
-        found = decode_scene(logits, params, max_detections=9, **options)
-        valid = np.asarray(found.is_valid[0])
-        assert (np.asarray(found.scores[0])[valid] > threshold).all()
-        assert (np.asarray(found.boxes[0])[valid, 0] <= 100 * threshold).all()
-    assert _decode._cache_size() == count + 1
+        values = {"score_threshold": threshold, "nms_iou": nms_iou, "roi": roi}
+        found = jax.device_get(
+            _decode(maps_of(logits, params), GRID, RELEASED, **values)
+        )
+        valid = found.is_valid[0]
+        assert (found.scores[0][valid] > threshold).all()
+        assert (found.boxes[0][valid, 0] <= 100 * threshold).all()
+        # The options give the same as constants.
+        options = RELEASED.replace(**values | {"roi": tuple(map(float, roi))})
+        same = jax.device_get(_decode(maps_of(logits, params), GRID, options))
+        jax.tree.map(np.testing.assert_array_equal, found, same)
+    assert _decode._cache_size() == count + 4
 
 
 def test_frames_of_a_batch_do_not_mix():
     scenes = [scattered(num=n, seed=n)[:2] for n in (0, 3, 9)]
     batch = maps_of(*(np.concatenate(x) for x in zip(*scenes, strict=True)))
-    together = decode(batch, GRID, max_detections=16, score_threshold=0.3)
+    together = decode(batch, GRID)
     for i, scene in enumerate(scenes):
         alone = decode_scene(*scene)
         for found, wanted in zip(
@@ -371,7 +353,7 @@ def test_frames_of_a_batch_do_not_mix():
 def test_bfloat16_maps_and_saturated_or_missing_numbers():
     logits, params, _, _ = scattered()
     low = jax.tree.map(lambda x: x.astype(jnp.bfloat16), maps_of(logits, params))
-    found = decode(low, GRID, max_detections=16, score_threshold=0.3)
+    found = decode(low, GRID)
     assert found.boxes.dtype == found.scores.dtype == jnp.float32
     assert int(found.is_valid.sum()) == 6
     for value in (np.inf, 100.0, np.nan, -np.inf):
@@ -384,23 +366,18 @@ def test_bfloat16_maps_and_saturated_or_missing_numbers():
 @pytest.mark.wrong_types
 def test_wrong_shapes_are_rejected():
     logits, params, _, _ = scattered()
-    run = partial(D.decode, max_detections=4, score_threshold=0.3)
-    with pytest.raises(
-        ValueError, match=r"\(1, 20, 12, 3\) .* on the grid's 256 x 107 bins"
+    maps, few = maps_of(logits, params), maps_of(logits, params[..., :7])
+    for call, message in (
+        (lambda: D.decode(maps, KRADAR, RELEASED), "on the grid's 256 x 107 bins"),
+        (lambda: D.decode(few, GRID, RELEASED), r"12, 7\), expected \[B, R, A, C\]"),
+        (lambda: D.decode(maps, GRID, RELEASED, pre_nms=0), "1 peak must enter NMS"),
+        (lambda: D.decode(maps, GRID, RELEASED, roi=np.zeros(4)), r"roi must be \[6\]"),
+        (lambda: RELEASED.replace(raw_yaw="yes"), "config.decode.raw_yaw is 'yes'"),
+        (lambda: RELEASED.replace(max_detections=0), "max_detections is 0, expected"),
+        (lambda: RELEASED.replace(roi=(0, 1)), "config.decode.roi is .* six numbers"),
     ):
-        run(maps_of(logits, params), KRADAR)
-    with pytest.raises(
-        ValueError, match=r"12, 7\), expected \[B, R, A, C\] and \[B, R, A, 8\]"
-    ):
-        run(maps_of(logits, params[..., :7]), GRID)
-    with pytest.raises(ValueError, match="at least 1 peak must enter NMS, got 0"):
-        D.decode(maps_of(logits, params), GRID, max_detections=0, score_threshold=0.3)
-    with pytest.raises(ValueError, match="1 peak must enter NMS, got 0"):
-        run(maps_of(logits, params), GRID, pre_nms=0)
-    with pytest.raises(ValueError, match=r"roi must be \[6\]"):
-        run(maps_of(logits, params), GRID, roi=np.zeros(4))
-    with pytest.raises(ValueError, match=r"raw_yaw must be one of .*, got 'yes'"):
-        run(maps_of(logits, params), GRID, raw_yaw="yes")
+        with pytest.raises(ValueError, match=message):
+            call()
 
 
 @pytest.mark.parametrize("raw_yaw", ["nms", "always"])
@@ -414,7 +391,8 @@ def test_a_size_is_never_negative(raw_yaw):
     least = np.float32(0.01)
     width = 1.5 if raw_yaw == "nms" else least  # the yaw vector's length is 0
     np.testing.assert_array_equal(found.boxes[0, 0, 3:6], [least, width, least])
-    assert found.num_clipped.tolist() == [1, 0]
+    boxes = found.to_boxes()
+    assert boxes.frame[boxes.is_clipped].tolist() == [0]
     np.testing.assert_array_equal(found.boxes[0, 1], released.boxes[0, 1])
     assert float(released.boxes[0, 0, 3]) == (
         np.float32(-0.2) if raw_yaw == "nms" else 0.0

@@ -85,12 +85,6 @@ def test_any_overlap_relation(seed, density):
     np.testing.assert_array_equal(suppression(overlaps, is_valid), expected)
 
 
-def test_longest_possible_chain():
-    overlaps = np.eye(K, k=1, dtype=bool) | np.eye(K, k=-1, dtype=bool)
-    keep = suppression(overlaps, np.ones(K, bool))
-    np.testing.assert_array_equal(keep, np.arange(K) % 2 == 0)
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_bad_boxes_in_padding_rows_disturb_nothing(bad):
     boxes = random_boxes(np.random.default_rng(1))

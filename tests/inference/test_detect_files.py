@@ -1,4 +1,4 @@
-"""Frames in folders, their images, models of every kind, names of results."""
+"""Frames in folders, their images, and the files of their boxes."""
 
 import csv
 import json
@@ -12,15 +12,10 @@ from radejax.config import Config
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.data.cameras import CameraOptions
+from radejax.data.kradar.radar_files import find_frames
 from radejax.evaluation.files import Source
 from radejax.evaluation.files import load as load_tables
-from radejax.inference.detect_files import (
-    detect_files,
-    find_frames,
-    front_images,
-    key_of,
-)
-from radejax.inference.saved import load_model, save_model
+from radejax.inference.detect_files import detect_files, find_inputs, front_images
 from radejax.models.options import DinoRadeOptions, ImageOptions
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
@@ -28,83 +23,44 @@ from radejax.simulation.dataset import simulate_dataset
 from .. import small_models as small
 
 
-@pytest.fixture
-def root(tmp_path):
-    for name in (
-        "5/radar_tesseract/tesseract_00033.mat",
-        "5/radar_tesseract/tesseract_00034.mat",
-        "5/DERA_tesseract/DERA_tesseract_00034.npy",
-        "5/info_label/00033_00001.txt",
-        "6/radar_tesseract/tesseract_00033.mat",
-    ):
-        path = tmp_path / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.touch()
-    return tmp_path
-
-
-def test_every_frame_is_found_once_and_its_projection_preferred(root, monkeypatch):
-    found = [path.relative_to(root).as_posix() for path in find_frames([root])]
-    assert sorted(found) == [
-        "5/DERA_tesseract/DERA_tesseract_00034.npy",
-        "5/radar_tesseract/tesseract_00033.mat",
-        "6/radar_tesseract/tesseract_00033.mat",
-    ]
-    assert find_frames([root, root / "5"]) == find_frames([root])
-    monkeypatch.chdir(root)
-    assert len(find_frames([root, "."])) == 3
-
-
-def test_names_of_results_are_unique_among_sequences(root):
-    names = {key_of(path).replace("/", "_") for path in find_frames([root])}
-    assert names == {"5_00033", "5_00034", "6_00033"}
-
-
-def test_a_part_of_the_frames(root):
-    for sequence, weather in (("5", "fog"), ("6", "rain")):
-        (root / sequence / "description.txt").write_text(f"urban,day,{weather}\n")
-    assert [key_of(p) for p in find_frames([root], (6, 9))] == ["6/00033"]
-    assert len(find_frames([root], weather=("fog",))) == 2
-    with pytest.raises(UserError, match=r"no frames for .*, 5, rain: looked for"):
-        find_frames([root], (5,), ("rain",))
-
-
-def test_nothing_found_and_nothing_there(tmp_path):
-    with pytest.raises(UserError, match=r"no frames for .*: looked for tesseract_\*"):
-        find_frames([tmp_path])
-    with pytest.raises(FileNotFoundError, match="no such file or folder"):
-        find_frames([tmp_path / "gone"])
-
-
-def test_boxes_of_an_exported_folder(tmp_path):
-    detector = small.detector(batch_sizes=(2,))  # as below
-    save_model(detector.saved, tmp_path / "packed")
-    frames = small.projections(3)
-    for i, frame in enumerate(frames):
-        path = tmp_path / "data" / "7" / "DERA_tesseract" / f"DERA_tesseract_{i:05}.npy"
+def _write_projections(folder, names, frames):
+    for name, frame in zip(names, frames, strict=True):
+        path = folder / name.replace("/", "/DERA_tesseract/DERA_tesseract_")
+        path = path.with_suffix(".npy")
         path.parent.mkdir(parents=True, exist_ok=True)
         np.save(path, np.moveaxis(frame, -1, 0))
-    out = tmp_path / "out"
-    count = detect_files(tmp_path / "packed", [tmp_path / "data"], out, batch_size=2)
+
+
+def test_every_format_has_the_same_boxes(tmp_path):
+    detector = small.detector(batch_sizes=(2,))
+    frames, keys = small.projections(3), [f"7/0000{i}" for i in range(3)]
+    _write_projections(tmp_path / "data", keys, frames)
+    inputs = find_inputs(detector, [tmp_path / "data"])
+    assert inputs.keys == keys
     expected = detector(frames).to_list()
-    assert count.pop("clipped") == detector(frames).num_clipped.sum()
-    assert count == {"frames": 3, "boxes": sum(map(len, expected))}
-    for i, boxes in enumerate(expected):
-        found = json.loads((out / f"7_{i:05}.json").read_text())
-        assert [b["cls"] for b in found] == [b["cls"] for b in boxes]
-        assert [b["x"] for b in found] == pytest.approx(
-            [b["x"] for b in boxes], abs=1e-5
+    for file_format in ("json", "kitti", "csv"):
+        out = tmp_path / file_format
+        count = detect_files(
+            detector, inputs, out, batch_size=2, file_format=file_format
         )
-        assert all(b["frame"] == f"7/{i:05}" for b in found)
-    model, data, text = tmp_path / "packed", [tmp_path / "data"], tmp_path / "k"
-    detect_files(model, data, text, batch_size=2, file_format="kitti")
-    detect_files(model, data, tmp_path / "t", batch_size=2, file_format="csv")
-    with open(tmp_path / "t" / "boxes.csv", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    assert [row["frame"] for row in rows] == [
-        f"7/{i:05}" for i, boxes in enumerate(expected) for _ in boxes
+        clipped = int(detector(frames).to_boxes().is_clipped.sum())
+        num_boxes = sum(map(len, expected))
+        assert count == {"frames": 3, "boxes": num_boxes, "clipped": clipped}
+    rows = [
+        {"frame": key, **box}
+        for key, boxes in zip(keys, expected, strict=True)
+        for box in boxes
     ]
-    assert float(rows[0]["yaw"]) == pytest.approx(expected[0][0]["yaw"], abs=1e-5)
+    files_of_frames = sorted((tmp_path / "json").iterdir())
+    assert [path.name for path in files_of_frames] == [
+        f"7_0000{i}.json" for i in range(3)
+    ]
+    assert [
+        row for path in files_of_frames for row in json.loads(path.read_text())
+    ] == rows
+    with open(tmp_path / "csv" / "boxes.csv", encoding="utf-8") as file:
+        table = list(csv.DictReader(file))
+    assert table == [{name: str(x) for name, x in row.items()} for row in rows]
     # Either is scored against labels whose frames have the key of both sensors.
     table = {
         "frame": [4, 5],
@@ -114,42 +70,31 @@ def test_boxes_of_an_exported_folder(tmp_path):
     files.write_json(tmp_path / "truth.json", [])
     files.write_json(tmp_path / "frames.json", table)
     source = Source(ground_truth=str(tmp_path / "truth.json"))
-    _, found, *_ = load_tables(out, source, detector.classes)
+    _, found, *_ = load_tables(tmp_path / "json", source, detector.classes)
     counts = np.bincount(found.frame, minlength=6).tolist()
     assert counts == [0, 0, 0, 0, len(expected[2]), len(expected[1])]
-    _, kitti, *_ = load_tables(tmp_path / "k", source, detector.classes)
+    _, kitti, *_ = load_tables(tmp_path / "kitti", source, detector.classes)
     found, kitti = (boxes.take(np.argsort(boxes.score)) for boxes in (found, kitti))
     for name in ("frame", "box", "cls"):
         np.testing.assert_array_equal(getattr(found, name), getattr(kitti, name))
-    with pytest.raises(UserError, match=r"packed holds one model .* step=best"):
-        load_model(tmp_path / "packed", step="best")
 
 
 def test_preceding_frames_of_files_are_of_their_sequence(tmp_path):
     """Frames 7, 8 and 10 of a sequence, and 11 of the next one."""
     detector = small.detector(num_frames=2, batch_sizes=(2,))
-    save_model(detector.saved, tmp_path / "packed")
-    names = ("1/DERA_tesseract/DERA_tesseract_00007.npy",)
-    names += ("1/DERA_tesseract/DERA_tesseract_00008.npy",)
-    names += ("1/DERA_tesseract/DERA_tesseract_00010.npy",)
-    names += ("2/DERA_tesseract/DERA_tesseract_00011.npy",)
     frames = small.projections(4)
-    for name, frame in zip(names, frames, strict=True):
-        path = tmp_path / "data" / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        np.save(path, np.moveaxis(frame, -1, 0))
+    _write_projections(
+        tmp_path / "data", ("1/00007", "1/00008", "1/00010", "2/00011"), frames
+    )
+    inputs = find_inputs(detector, [tmp_path / "data"])
     expected = detector(np.stack([frames[[0, 0, 2, 3]], frames], 1)).to_list()
     for batch_size in (1, 2, 8):
         out = tmp_path / f"out{batch_size}"
-        count = detect_files(
-            tmp_path / "packed", [tmp_path / "data"], out, batch_size=batch_size
-        )
+        count = detect_files(detector, inputs, out, batch_size=batch_size)
         assert (count["frames"], count["repeated"]) == (4, 3)
         for path, boxes in zip(sorted(out.iterdir()), expected, strict=True):
-            found = json.loads(path.read_text())
-            assert [b["score"] for b in found] == pytest.approx(
-                [b["score"] for b in boxes], abs=1e-5
-            )
+            scores = [box["score"] for box in json.loads(path.read_text())]
+            assert scores == pytest.approx([box["score"] for box in boxes], abs=1e-5)
 
 
 def test_two_frames_of_one_name_are_rejected(tmp_path):
@@ -157,11 +102,8 @@ def test_two_frames_of_one_name_are_rejected(tmp_path):
         path = tmp_path / disk / "5" / "radar_tesseract" / "tesseract_00033.mat"
         path.parent.mkdir(parents=True)
         path.touch()
-    save_model(small.saved(), tmp_path / "model")
     with pytest.raises(UserError, match=r"a/5/.* and .*b/5/.* frame 5/00033"):
-        detect_files(
-            tmp_path / "model", [tmp_path / "a", tmp_path / "b"], tmp_path / "out"
-        )
+        find_inputs(small.detector(), [tmp_path / "a", tmp_path / "b"])
 
 
 def test_images_of_simulated_folders_are_found(tmp_path):

@@ -53,10 +53,6 @@ def test_tesseracts_projections_and_files_agree(
     _equal(detector([path, path]), detector(projections[[0, 0]]))
     _equal(detector(list(projections[:2])), detector(projections[:2]))
     _equal(detector(tuple(tesseracts[:2])), detector(projections[:2]))
-    with pytest.raises(UserError, match="the list is empty"):
-        detector([])
-    with pytest.raises(ValueError, match="must have the same shape"):
-        detector([projections[0], projections[0, :8]])
 
 
 def test_any_batch_size_runs_in_the_compiled_sizes(detector, projections):
@@ -83,6 +79,8 @@ def test_thresholds_and_region_change_without_compiling(detector, projections):
     assert 0 < len(boxes) < scores.size
     assert (boxes[:, 0] <= 15).all()
     assert (np.abs(boxes[:, 1]) <= 5).all()
+    everywhere = detector(projections[:1], roi=(-np.inf, np.inf) * 3)
+    _equal(everywhere, default, atol=0)
     assert detector._run._cache_size() == before
 
 
@@ -132,41 +130,30 @@ def test_samples_of_two_frames_and_a_stream_with_a_history(
         two(projections[0])
 
 
-def test_a_stream_of_samples_counts_every_invalid_frame_once():
-    two = small.detector(num_frames=3, batch_sizes=(1, 4))
-    frames = small.projections(4)
-    frames[1, 0, 0, 0] = np.nan
-    assert len(list(two.stream([frames[:2], frames[2:]]))) == 2
-    assert two.num_invalid_frames == 1
-
-
-def test_detections_as_columns_lists_and_text(detector, projections):
+def test_detections_as_boxes_lists_and_text(detector, projections):
     found = detector(projections[:2])
-    columns, rows = found.to_columns(), found.to_list()
+    table, rows = found.to_boxes(), found.to_list()
     counts = found.is_valid.sum(1).tolist()
-    assert np.bincount(columns["frame"]).tolist() == list(map(len, rows)) == counts
+    assert np.bincount(table.frame).tolist() == list(map(len, rows)) == counts
+    # Frames that pad a batch are left out.
+    second = found.to_boxes(np.array([-1, 7]))
+    np.testing.assert_array_equal(second.box, table.box[table.frame == 1])
+    assert set(second.frame) == {7}
     names = ("x", "y", "z", "l", "w", "h", "yaw")
     box, score = np.asarray(found.boxes[0, 0]), float(found.scores[0, 0])
     first = dict(zip(names, box, strict=True)) | {"score": score}
     first["cls"] = detector.classes[int(found.classes[0, 0])]
     assert rows[0][0] == pytest.approx(first)
-    texts = prediction_texts(found)
+    texts = prediction_texts(table, range(2))
     assert [len(text.splitlines()) for text in texts] == counts
     words = texts[0].splitlines()[0].split(" ")
     assert words[0] in ("sed", "bus", "ped", "mot", "bic")
     numbers = [float(word) for word in words[8:]]  # h w l y z x yaw score
     assert numbers == pytest.approx([*box[[5, 4, 3, 1, 2, 0, 6]], score])
     nothing = detector(projections[:1], score_threshold=1.0)
-    assert prediction_texts(nothing) == ["dummy -1 -1 0 0 0 0 0 0 0 0 0 0 0 0 0"]
-
-
-def test_a_wrong_shape_names_what_was_expected(detector):
-    with pytest.raises(
-        UserError, match=r"\[3, 16, 14, 6\]; expected projections .*\[B, 16, 14, 5\]"
-    ):
-        detector(np.zeros((3, 16, 14, 6), np.float32))
-    with pytest.raises(UserError, match=r"\[0, 16, 14, 5\]; expected"):
-        detector(np.zeros((0, 16, 14, 5), np.float32))
+    assert prediction_texts(nothing.to_boxes(), [0]) == [
+        "dummy -1 -1 0 0 0 0 0 0 0 0 0 0 0 0 0"
+    ]
 
 
 def test_memory_of_the_caller_may_be_refilled(detector, projections):
@@ -215,7 +202,8 @@ def test_region_of_decode_options_holds_where_none_is_given(detector, projection
     boxes = np.asarray(found.boxes)[np.asarray(found.is_valid)]
     assert len(boxes)
     assert (boxes[:, 0] <= 15).all()
-    assert Detector(saved, roi=other).decode_options["roi"] == other
+    assert Detector(saved, roi=other).decode_options.roi == other
+    assert Detector(saved, roi="narrow").decode_options.roi == NARROW_ROI
 
 
 def test_detections_carry_the_names_of_their_detector(detector, projections):
@@ -230,46 +218,40 @@ def test_detections_carry_the_names_of_their_detector(detector, projections):
     assert detector(projections[0]).to_list()[0][0]["cls"] == CLASSES[index]
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, 1e38])
 def test_invalid_frames_are_counted_and_warned_of_once(
-    detector, projections, caplog, value
+    detector, tesseracts, projections, caplog
 ):
-    detector = detector.replace(batch_sizes=(1, 4))
-    frames = projections[:3].copy()
-    detector(frames)
-    assert detector.num_invalid_frames == 0
-    frames[1, 2, 3, 1] = value
-    for _ in range(2):
-        detector(frames)
-    assert detector.num_invalid_frames == 2
-    warnings = [r.getMessage() for r in caplog.records if r.levelname == "WARNING"]
-    assert len(warnings) == 1
-    assert (
-        "1 of 3 frames are not linear power or its projection: some values"
-        in warnings[0]
-    )
+    def count(*calls, made=detector):
+        made = made.replace(batch_sizes=(1, 4))
+        caplog.clear()
+        for frames in calls:
+            list(made.stream(frames)) if isinstance(frames, list) else made(frames)
+        return made.num_invalid_frames, caplog.text
 
+    def spoiled(frames, value):
+        frames = frames[:3].copy()
+        frames[(1, 1, *[2] * (frames.ndim - 2))] = value
+        return frames
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -1.0])
-def test_one_invalid_cell_of_a_tesseract_is_found(detector, tesseracts, value):
-    detector = detector.replace(batch_sizes=(4,))
-    frames = tesseracts[:3].copy()
-    frames[2, 1, 3, 2, 5] = value
-    detector(frames)
-    assert detector.num_invalid_frames == 1
-
-
-def test_decibels_are_warned_of(detector, tesseracts, projections, caplog):
-    detector = detector.replace(batch_sizes=(4,))
-    decibels = 10.0 * np.log10(tesseracts[:2])
-    detector(np.concatenate([decibels, tesseracts[:1]]))
-    assert "2 of 3 frames are not linear power" in caplog.text
-    assert "as in decibels" in caplog.text
-    detector(184.3 * projections[:3] - 1.2)
-    assert detector.num_invalid_frames == 5
-    detector((255 * projections[:3]).astype(np.uint8))  # as of records
-    detector(jnp.asarray(projections[:3]))
-    assert detector.num_invalid_frames == 5
+    assert count(projections, tesseracts)[0] == 0
+    for value in (np.nan, np.inf, 1e38):
+        number, text = count(spoiled(projections, value), spoiled(projections, value))
+        assert number == 2
+        assert text.count("1 of 3 frames are not linear power or its projection") == 1
+    for value in (np.nan, np.inf, -1.0):
+        assert count(spoiled(tesseracts, value))[0] == 1
+    decibels = np.concatenate([10 * np.log10(tesseracts[:2]), tesseracts[:1]])
+    number, text = count(decibels)
+    assert number == 2
+    assert "2 of 3 frames" in text
+    assert "as in decibels" in text
+    levels = 184.3 * projections[:3] - 1.2
+    assert count(levels)[0] == 3
+    # Neither stored levels nor arrays on a device are checked.
+    assert count((255 * projections[:3]).astype(np.uint8), jnp.asarray(levels))[0] == 0
+    three = small.detector(num_frames=3)
+    frames = spoiled(projections, np.nan)
+    assert count([frames[:2], frames[2:]], made=three)[0] == 1  # in three samples
 
 
 def test_arrays_of_other_kinds(detector, tesseracts):
@@ -281,15 +263,6 @@ def test_arrays_of_other_kinds(detector, tesseracts):
         list(tesseracts[:2].astype("O")),
     ):
         np.testing.assert_array_equal(detector(kind).boxes, wanted)
-    masked[0, 0, 0, 0, 0] = np.ma.masked
-    for wrong, message in (
-        (masked, "frames: 1 values are masked"),
-        (tesseracts[:2] > 0, "frames: array of bool, expected real numbers"),
-        (tesseracts[:2] * 1j, "array of complex64"),
-        (np.full(tesseracts.shape, "x", object), "array of object"),
-    ):
-        with pytest.raises(UserError, match=message):
-            detector(wrong)
 
 
 def test_warming_up_compiles_for_the_inputs_of_the_sample(tesseracts):
@@ -306,27 +279,46 @@ def test_warming_up_compiles_for_the_inputs_of_the_sample(tesseracts):
     assert sizes == [0, 1, 1, 2, 2]
 
 
-def test_arguments_by_name_and_wrong_ones():
-    detector = small.detector(roi="narrow")
-    assert tuple(detector.decode_options["roi"]) == tuple(NARROW_ROI)
-    for wrong, message in (
+def test_wrong_arguments_are_named(detector, tesseracts):
+    shape = tesseracts.shape
+    masked = np.ma.masked_less(tesseracts[:2], 0)
+    masked[0, 0, 0, 0, 0] = np.ma.masked
+    nan = (0, 72, None, None, -2, 6)
+    for call, message in (
+        (lambda: detector([]), "the list is empty"),
         (
-            {"roi": "middle"},
-            "roi is 'middle', expected narrow, wide or six numbers x0 < x1",
+            lambda: detector(np.zeros((3, 16, 14, 6))),
+            r"\[3, 16, 14, 6\]; expected proj",
         ),
-        ({"roi": (0, 1)}, r"roi is \(0, 1\), expected narrow"),
+        (lambda: detector(np.zeros((0, 16, 14, 5))), r"\[0, 16, 14, 5\]; expected"),
+        (lambda: detector(masked), "frames: 1 values are masked"),
+        (lambda: detector(tesseracts > 0), "frames: array of bool, expected real"),
+        (lambda: detector(tesseracts * 1j), "array of complex64"),
+        (lambda: detector(np.full(shape, "x", object)), "array of object"),
         (
-            {"roi": (0, 72, None, None, -2, 6)},
-            r"roi is \(0, 72, None, None, -2, 6\), exp",
+            lambda: detector(tesseracts, roi="middle"),
+            "roi is 'middle', expected narrow",
+        ),
+        (lambda: small.detector(roi=(0, 1)), r"roi is \(0, 1\), expected narrow"),
+        (lambda: small.detector(roi=nan), r"roi is \(0, 72, None, None, -2, 6\), exp"),
+        (
+            lambda: small.detector(roi=(72, 0, -6, 6, -2, 6)),
+            r"roi is \(72, 0, .* expect",
         ),
         (
-            {"roi": (72, 0, -6, 6, -2, 6)},
-            r"roi is \(72, 0, -6, 6, -2, 6\), expected narrow",
+            lambda: small.detector(batch_sizes=(0,)),
+            r"batch_sizes is \(0,\), expected int",
         ),
-        ({"batch_sizes": (0,)}, r"batch_sizes is \(0,\), expected integers of"),
-        ({"batch_sizes": ()}, r"batch_sizes is \(\), expected"),
-        ({"nms_iou": 1.5}, r"nms_iou is 1.5, expected a number"),
-        ({"score_threshold": np.nan}, r"score_threshold is nan, expected a"),
+        (lambda: small.detector(batch_sizes=()), r"batch_sizes is \(\), expected"),
+        (lambda: small.detector(nms_iou=1.5), "nms_iou is 1.5, expected a number"),
+        (
+            lambda: small.detector(score_threshold=np.nan),
+            "score_threshold is nan, expect",
+        ),
+        (lambda: small.detector(dtype="float16"), "dtype is 'float16'"),
+        (lambda: small.detector()(tesseracts, [None], "x"), "the model is radar-only"),
     ):
         with pytest.raises(UserError, match=message):
-            small.detector(**wrong)
+            call()
+    with pytest.raises(ValueError, match="must have the same shape"):
+        detector([tesseracts[0], tesseracts[0, :, :8]])

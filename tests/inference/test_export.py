@@ -143,8 +143,6 @@ def test_a_program_of_two_frames_takes_the_channels_of_both(tmp_path):
     again = Detector.from_workdir(tmp_path)
     assert again.num_frames == 2
     _check(found, "1", again(frames))
-    with pytest.raises(UserError, match=r"input is 'tensor', expected projection, as"):
-        export.export(detector, tmp_path, radar_input="tensor")
 
 
 def test_a_program_of_one_batch_size_and_platform_has_static_shapes(tmp_path):
@@ -246,18 +244,23 @@ def test_huggingface_files_name_what_is_left_out(tmp_path):
         "config.json",
         "model.safetensors",
     }
-    with pytest.raises(UserError, match="format is 'tflite'"):
-        export.export(small.detector(), tmp_path, kind="tflite")
 
 
-def test_onnx_without_its_library_says_what_to_install(tmp_path, monkeypatch):
+def test_wrong_options_are_named_before_anything_is_written(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "jax2onnx", None)
-    with pytest.raises(UserError, match=r"needs jax2onnx: pip install -e '.\[onnx\]'"):
-        export.export(small.detector(), tmp_path, kind="onnx")
-    with pytest.raises(UserError, match="image backbone cannot be exported"):
-        export.export(
-            small.detector("camera"), tmp_path, kind="onnx", with_backbone=True
-        )
+    radar, two = small.detector(), small.detector(num_frames=2)
+    onnx = {"kind": "onnx", "with_backbone": True}
+    for detector, options, message in (
+        (radar, {"kind": "tflite"}, "format is 'tflite'"),
+        (radar, {"platforms": ("cpu", "metal")}, "platforms is .* expected some of"),
+        (radar, {"half": True}, "--half is only supported with --format huggingface"),
+        (radar, {"radar_input": "power"}, "input is 'power', expected one of"),
+        (two, {"radar_input": "tensor"}, "input is 'tensor', expected projection, as"),
+        (radar, {"kind": "onnx"}, r"needs jax2onnx: pip install -e '.\[onnx\]'"),
+        (small.detector("camera"), onnx, "image backbone cannot be exported"),
+    ):
+        with pytest.raises(UserError, match=message):
+            export.export(detector, tmp_path, **options)
     assert not any(tmp_path.iterdir())
 
 

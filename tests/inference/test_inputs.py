@@ -7,12 +7,13 @@ import pytest
 from radejax import Detector, UserError
 from radejax.core.structures import Batch
 from radejax.data.cameras import CameraOptions
+from radejax.data.options import DataOptions
 from radejax.geometry.camera import (
     KRADAR_RADAR_FROM_LIDAR_Z_M,
     RADAR_FROM_LIDAR_M,
     stack_cameras,
 )
-from radejax.inference.detector import camera_batch
+from radejax.inference.inputs import InputReader
 
 from .. import small_models as small
 
@@ -20,6 +21,11 @@ from .. import small_models as small
 @pytest.fixture(scope="module")
 def fusion():
     return small.detector("camera")
+
+
+def _read_cameras(fusion, *arguments, **options):
+    data = DataOptions(camera=CameraOptions(**options))
+    return InputReader(fusion.model, fusion.grid, data).read_cameras(*arguments)
 
 
 def _equal(a, b):
@@ -101,13 +107,8 @@ def test_embedded_images_and_weights_without_the_backbone(fusion):
         UserError, match="without the image backbone: give image_backbone"
     ):
         lean(projection, image, small.calibration())
-
-
-def test_batches_with_images_need_the_weights_of_the_backbone(fusion):
-    detector = fusion.replace(variables=_without_backbone(fusion.variables))
-    rows = [None] * 4  # boxes, classes, is_valid, frame
     with pytest.raises(UserError, match="without the image backbone"):
-        detector(Batch(small.projections(1), *rows, small.images(1)))
+        lean(Batch(projection, None, None, None, None, image))
 
 
 def test_a_stream_of_frames_with_images(fusion):
@@ -137,35 +138,24 @@ def test_a_stream_of_frames_with_images(fusion):
 )
 def test_what_does_not_fit_is_named(image, camera, message, fusion):
     with pytest.raises((UserError, FileNotFoundError), match=message):
-        camera_batch(image, camera, 2, fusion.model, CameraOptions())
+        _read_cameras(fusion, image, camera, 2)
 
 
-def test_a_radar_model_takes_no_image():
-    with pytest.raises(UserError, match="radar-only"):
-        small.detector()(small.projections(1), small.images(1), small.calibration())
-
-
-def test_the_shift_and_projection_of_a_config_are_used():
+def test_the_shift_and_projection_of_a_config_are_used(fusion):
     calibration = small.calibration(distortion=(0.1, 0, 0, 0, 0))
-    options = CameraOptions(
-        projection="pinhole", radar_from_lidar_m=(-2.08, -0.13, 0.9)
-    )
-    model = small.detector("camera").model
-    _, camera, _ = camera_batch(small.images(1), calibration, 1, model, options)
+    options = {"projection": "pinhole", "radar_from_lidar_m": (-2.08, -0.13, 0.9)}
+    _, camera, _ = _read_cameras(fusion, small.images(1), calibration, 1, **options)
     assert not camera.distortion.any()
     expected = -calibration.rotation @ np.array([-2.08, -0.13, 0.9])
     np.testing.assert_allclose(camera.cam_from_ego[0, :, 3], expected, atol=1e-6)
 
 
-def test_the_height_of_the_radar_is_the_models_or_kradars(tmp_path):
+def test_the_height_of_the_radar_is_the_models_or_kradars(fusion, tmp_path):
     path = tmp_path / "cam_front0.yml"
     path.write_text(small.calibration().to_kradar_text())
-    model = small.detector("camera").model
 
     def shift(camera, **options):
-        _, camera, _ = camera_batch(
-            small.images(1), camera, 1, model, CameraOptions(**options)
-        )
+        _, camera, _ = _read_cameras(fusion, small.images(1), camera, 1, **options)
         return -small.calibration().rotation.T @ camera.cam_from_ego[0, :, 3]
 
     own = small.calibration(radar_from_lidar_m=(1.0, 2.0, 3.0))

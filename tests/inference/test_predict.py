@@ -75,16 +75,16 @@ def _saved(setup):
 
 
 def _assert_same(actual, expected):
-    np.testing.assert_array_equal(actual["frame"], expected["frame"])
-    np.testing.assert_array_equal(actual["cls"], expected["cls"])
-    np.testing.assert_allclose(actual["score"], expected["score"], rtol=1e-5)
-    np.testing.assert_allclose(actual["box"], expected["box"], rtol=1e-4, atol=1e-4)
+    np.testing.assert_array_equal(actual.frame, expected.frame)
+    np.testing.assert_array_equal(actual.cls, expected.cls)
+    np.testing.assert_allclose(actual.score, expected.score, rtol=1e-5)
+    np.testing.assert_allclose(actual.box, expected.box, rtol=1e-4, atol=1e-4)
 
 
 def test_eight_devices_and_a_detector_predict_the_same_as_one(setup):
     expected = _predict(setup, 1)
-    assert set(expected["frame"]) == set(range(5))
-    assert len(expected["frame"]) > 50
+    assert set(expected.frame) == set(range(5))
+    assert len(expected) > 50
     _assert_same(_predict(setup, 8), expected)
     detector = Detector(_saved(setup), score_threshold=0.45)
     alone = predict_dataset(detector, setup.records, setup.frames, 3, progress=False)

@@ -13,7 +13,7 @@ from radejax.config import Config
 from radejax.core.errors import UserError
 from radejax.core.structures import DetectionMaps
 from radejax.data.kradar import Frame
-from radejax.detection.decode import decode
+from radejax.detection.decode import DecodeOptions, decode
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.runs import evaluate
 from radejax.runs.evaluate import report_options
@@ -64,7 +64,8 @@ def test_a_cut_when_scoring_is_a_cut_when_decoding() -> None:
     )
 
     def columns(score: float) -> dict[str, np.ndarray]:
-        return decode(maps, grid, max_detections=60, score_threshold=score).to_columns()
+        options = DecodeOptions(max_detections=60, score_threshold=score)
+        return decode(maps, grid, options).to_boxes().columns()
 
     low, high = columns(0.05), columns(0.3)
     assert len(low["score"]) > len(high["score"]) > 10

@@ -11,7 +11,8 @@ import pytest
 from radejax.config import Config, load_config
 from radejax.core.errors import UserError
 from radejax.data.kradar import dataset
-from radejax.inference.detect_files import detect_files
+from radejax.inference.detect_files import detect_files, find_inputs
+from radejax.inference.detector import Detector
 from radejax.inference.saved import load_model
 from radejax.runs import evaluate, experiment
 from radejax.runs.experiment import claimed
@@ -136,7 +137,8 @@ def test_a_run_of_two_frames(
     assert kernel.shape[-2] == 2 * 4
     assert len(list((tmp_path / "data" / "records").glob("*/*.npy"))) == 9
     root, out = tmp_path / "data", tmp_path / "boxes"
-    count = detect_files(folder, [root], out, score_threshold=0.0)
+    detector = Detector.from_workdir(folder, score_threshold=0.0)
+    count = detect_files(detector, find_inputs(detector, [root]), out)
     assert (count["frames"], count["repeated"]) == (9, 3)
     one = config.replace(data={"num_frames": 1})
     with pytest.raises(UserError, match=r"run do not fit config.model .*stem/doppler"):

@@ -10,7 +10,7 @@ import optax
 import pytest
 
 from radejax.core.structures import to_float
-from radejax.detection.decode import decode
+from radejax.detection.decode import DecodeOptions, decode
 from radejax.geometry.boxes import boxes7_from_8
 from radejax.geometry.rotated_iou import bev_iou
 from radejax.training import distributed
@@ -70,7 +70,7 @@ def test_one_scene_is_learnt_by_heart(tiny: Tiny, start: Any, step: Any) -> None
     maps = jax.jit(tiny.model.apply)(
         state.eval_variables, to_float(batch.projection[:1])
     )
-    found = decode(maps, tiny.map_grid, max_detections=8, score_threshold=0.3)
+    found = decode(maps, tiny.map_grid, DecodeOptions(max_detections=8))
     boxes = np.asarray(found.boxes[0])[np.asarray(found.is_valid[0])]
     wanted = np.asarray(boxes7_from_8(batch.boxes[0, :2]))
     overlap = np.asarray(bev_iou(wanted, boxes))

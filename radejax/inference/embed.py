@@ -1,0 +1,97 @@
+"""Features of an image backbone for the images of whole datasets.
+
+They are records, but `data` cannot compute them, as it uses neither models nor weights.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import grain
+import jax
+import numpy as np
+import tqdm
+from jaxtyping import UInt8
+
+from radejax.core.errors import UserError
+from radejax.data.cameras import read_left_image
+from radejax.data.dataset import LabelledFrame
+from radejax.data.records import Records, embedding_fields
+from radejax.models.dinorade import IMAGE_BACKBONE, DinoRade
+from radejax.weights.image_backbone import weights_sha256
+
+
+def embed_dataset(
+    model: DinoRade,
+    variables: Mapping[str, Any],
+    frames: Sequence[LabelledFrame],
+    folder: str | os.PathLike,
+    *,
+    dtype: str | None = None,
+    resize: bool = False,
+    batch_size: int = 8,
+) -> dict[str, int]:
+    """Write the backbone's features of every front image that has none in the folder yet.
+
+    Args:
+        model: A `DinoRade` model.
+        variables: Variables with the backbone's parameters in `params/image_backbone`.
+        frames: Frames of a dataset, normally of all splits.
+        folder: Folder of the embeddings, created if missing.
+        dtype: Dtype of the stored features: "float32", with which training gives the same
+            results as with images, or "float16", which needs half the space. None for
+            that of existing ones, or float32 without any.
+        resize: Resize images of another size to the model's size.
+        batch_size: Number of images per batch.
+
+    Returns:
+        The number of all "frames", of newly "embedded" images, of "found" embeddings that
+        existed before, and of "missing" images.
+
+    Raises:
+        UserError: The folder contains other records, there are no frames, or the dtype is
+            unknown.
+        DataError: An image is corrupted or, without `resize`, of another size.
+    """
+    if not len(frames):
+        raise UserError("no frames to embed")
+    params = variables["params"][IMAGE_BACKBONE]
+    fields = embedding_fields(model.options.image.to_dict())
+    source = {"image": fields, "weights_sha256": weights_sha256(params)}
+    records = Records.create(folder, model.feature_shape, dtype, source, "float32")
+    keys = records.keys()
+    images = [f for f in frames if f.camera_path is not None and f.key not in keys]
+    found = sum(frame.key in keys for frame in frames)
+
+    def read(frame: Any) -> UInt8[np.ndarray, "H W 3"]:
+        return read_left_image(
+            frame.camera_path,
+            model.options.image.size,
+            resize=resize,
+            calibrated_size=frame.calibrated_size(),
+        )
+
+    embed = jax.jit(lambda params, image: model.apply(params, image, method="embed"))
+    params = jax.device_put({"params": {IMAGE_BACKBONE: params}})
+    batches: grain.IterDataset[np.ndarray] = (
+        grain.MapDataset.source(images)
+        .map(read)
+        .batch(batch_size)
+        .to_iter_dataset(grain.ReadOptions(2, prefetch_buffer_size=2))
+    )
+    with tqdm.tqdm(total=len(images), desc="embed") as bar:
+        for i, batch in enumerate(batches):
+            empty = [(0, batch_size - len(batch)), (0, 0), (0, 0), (0, 0)]
+            features = np.asarray(embed(params, np.pad(batch, empty)))
+            features = features.astype(records.dtype)
+            for row, frame in enumerate(images[i * batch_size :][: len(batch)]):
+                records.write(frame.key, features[row])
+            bar.update(len(batch))
+    return {
+        "frames": len(frames),
+        "embedded": len(images),
+        "found": found,
+        "missing": len(frames) - len(images) - found,
+    }

@@ -1,0 +1,401 @@
+"""Conversion of what users pass to a detector into arrays of one batch.
+
+Shapes, types and numbers are checked here, on the host, once per call.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import pathlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Real, UInt8
+
+from radejax import models
+from radejax.core.errors import UserError, require
+from radejax.core.files import PathLike, as_path
+from radejax.core.structures import ROIS, Array
+from radejax.data.cameras import CameraOptions, no_camera, read_left_image
+from radejax.data.kradar import reduced
+from radejax.data.kradar.tesseract import read_frame
+from radejax.data.options import DataOptions
+from radejax.data.projection import MAX_LEVEL, find_problem, to_log_scale
+from radejax.detection.decode import ROI_LIMITS, DecodeOptions, is_roi
+from radejax.geometry.camera import (
+    KRADAR_RADAR_FROM_LIDAR_Z_M,
+    RADAR_FROM_LIDAR_M,
+    Camera,
+    CameraCalibration,
+    stack_cameras,
+)
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.models.dinorade import IMAGE_BACKBONE
+
+Frames = Array | PathLike | Sequence[Array | PathLike]
+Images = Array | Sequence[Array | PathLike | None]
+Calibration = CameraCalibration | PathLike
+Calibrations = Camera | Calibration | Sequence[Camera | Calibration | None]
+
+_PATH = (str, os.PathLike)
+_KRADAR_FROM_LIDAR_M = (*RADAR_FROM_LIDAR_M[:2], KRADAR_RADAR_FROM_LIDAR_Z_M)
+
+
+class Inputs(NamedTuple):
+    """Inputs of a detector for B frames.
+
+    Attributes:
+        radar: Projections `[B, R, A, D+E]` or tensors `[B, D, R, E, A]`.
+        image: Images or features of them; None for the radar only.
+        camera: Cameras of the images with a leading axis B, or None.
+    """
+
+    radar: Real[Array, "B ..."]
+    image: Real[Array, "B _ _ _"] | None = None
+    camera: Any = None
+
+
+@dataclasses.dataclass(frozen=True)
+class InputReader:
+    """Converts the arguments of a detector to arrays.
+
+    Args:
+        model: The detector's model; a radar-only model takes neither images nor cameras.
+        grid: Axes of the sensor.
+        data: Options of the data that the model is for.
+    """
+
+    model: Any
+    grid: RadarGrid
+    data: DataOptions
+
+    def read_radar(self, frames: Frames, num_frames: int = 1) -> Real[Any, "B ..."]:
+        """Combine radar frames into one array with a leading axis B.
+
+        Args:
+            frames: Radar data: an array, a path, or a list of arrays and paths, see
+                `Detector.__call__`. Arrays of projections may be of any release.
+            num_frames: Number T of frames of a sample.
+
+        Returns:
+            Projections `[B T, R, A, D+E]` or tensors `[B T, D, R, E, A]`.
+
+        Raises:
+            UserError: The shape is that of no radar data, the data have another form than
+                those that the model is for, or there is no frame.
+            DataError: A file is corrupted, or one frame of a reduced release is not as in
+                the release.
+        """
+        radar = _read_paths(frames, self._read_file)
+        if isinstance(radar, list):
+            if not radar:
+                raise UserError("no frames: the list is empty")
+            radar = np.stack([self._projected(frame) for frame in radar])
+        radar = self._projected(radar)
+        shape = tuple(np.shape(radar))
+        steps = () if num_frames == 1 else (num_frames,)
+        projection = self.grid.projection_shape
+        tensor = self.grid.shape_drea
+        for frame in (projection, tensor):
+            if shape in ((*steps, *frame), (*shape[:1], *steps, *frame)) and shape[0]:
+                if frame == tensor:
+                    reduced.check_release(None, self.data.release, "frames")
+                return radar.reshape(-1, *frame)
+        axes = ", ".join(["B", *map(str, steps)])
+        hint = ""
+        if steps:
+            hint = (
+                f" of {num_frames} consecutive frames (config.data.num_frames), oldest "
+                "first; Detector.stream takes single frames and keeps preceding ones"
+            )
+        raise UserError(
+            f"frames have shape {list(shape)}; expected projections [{axes}, R, A, D+E] = "
+            f"[{axes}, {', '.join(map(str, projection))}] or tesseracts [{axes}, D, R, E, "
+            f"A] = [{axes}, {', '.join(map(str, tensor))}], or single frames [2, R, A, E] "
+            f"or [N, 11] of a reduced release{hint}"
+        )
+
+    def _read_file(self, path: pathlib.Path, _: int) -> Real[np.ndarray, "..."]:
+        # Records have projections of any form.
+        if path.suffix != ".npy" or path.name.startswith(("DERA_", *reduced.RELEASES)):
+            reduced.check_release(
+                reduced.release_of_file(path), self.data.release, str(path)
+            )
+        return read_frame(path, self.grid)
+
+    def _projected(self, frames: Any) -> Real[Any, "..."]:
+        """Convert an array to numbers, and frames of a reduced release to projections."""
+        array = as_numbers(frames, "frames")
+        if reduced.is_reduced(array, self.grid):
+            if array.shape[1] != 4:  # an error below explains points [N, 4]
+                found = "rpc" if array.ndim == 2 else "polar3d"
+                reduced.check_release(found, self.data.release, "frames")
+            return reduced.project_reduced(np.asarray(array), self.grid)
+        return array
+
+    def read_cameras(
+        self, image: Images | None, camera: Calibrations | None, num_frames: int
+    ) -> tuple[Real[Array, "B _ _ _"] | None, Camera | None, int]:
+        """Convert images and cameras to arrays, as the data pipeline makes them.
+
+        Args:
+            image: Images `[B, H, W, 3]` uint8 (or `[H, W, 3]` for a single frame), the
+                output of `model.embed` for them, or a list with one image, path or None
+                per frame.
+            camera: One calibration for all frames, or a list with one (or None) per frame.
+                A calibration is a `CameraCalibration`, the path of a K-Radar calibration
+                file, or a `Camera`. A batched `Camera` is also accepted.
+            num_frames: Number of frames B.
+
+        Returns:
+            Images `[B, ...]` and a `Camera` with leading axes B, both None if no images
+            are given, and the number of frames that a radar-camera model predicts without
+            an image.
+
+        Raises:
+            UserError: A size or number is not as expected, only one of image and camera is
+                given, or an image is missing where that is not allowed.
+        """
+        if not models.has_camera(self.model):
+            if image is None and camera is None:
+                return None, None, 0
+            raise UserError("image and camera are given, but the model is radar-only")
+        if (image is None) != (camera is None):
+            raise UserError("image and camera belong together: give both or none")
+        options = self.data.used_camera
+        images = cameras = None
+        has_image = np.zeros(num_frames, bool)
+        if image is not None:
+            cameras = self._cameras(camera, num_frames, options)
+            images, has_image = self._images(image, cameras, options.resize)
+            given = len(images), len(cameras.is_valid)
+            if given != (num_frames, num_frames):
+                raise UserError(
+                    f"{given[0]} images and {given[1]} cameras for {num_frames} frames"
+                )
+            has_image = has_image & np.asarray(cameras.is_valid, bool)
+            cameras = cameras.replace(is_valid=has_image)
+        num_missing = int((~has_image).sum())
+        if num_missing and not options.allow_missing:
+            raise UserError(
+                f"{num_missing} of {num_frames} frames have no image or calibration, the "
+                f"first is frame {int(has_image.argmin())} of the batch; "
+                "config.data.camera.allow_missing=True predicts them from the radar only"
+            )
+        return images, cameras, num_missing
+
+    def _images(
+        self, image: Any, cameras: Camera, resize: bool
+    ) -> tuple[Real[Array, "B _ _ _"], Bool[np.ndarray, " B"]]:
+        """Return the images as one array, and a mask that is True where one is given."""
+        size = self.model.options.image.size
+        calibrated_px = np.asarray(cameras.size_px, int)
+
+        def read(path: pathlib.Path, index: int) -> UInt8[np.ndarray, "H W 3"]:
+            # A wrong number of images is reported later.
+            width, height = calibrated_px[min(index, len(calibrated_px) - 1)]
+            return read_left_image(
+                path, size, resize=resize, calibrated_size=(height, width)
+            )
+
+        image = _read_paths(image, read)
+        if isinstance(image, list):
+            has_image = np.array([one is not None for one in image])
+            empty = np.zeros((*size, 3), np.uint8)
+            if has_image.any():
+                empty = np.zeros_like(np.asarray(image[has_image.argmax()]))
+            image = np.stack([empty if one is None else one for one in image])
+        else:
+            image = as_numbers(image, "image")
+            image = image[None] if image.ndim == 3 else image
+            has_image = np.ones(len(image), bool)
+        shapes = (*size, 3), self.model.feature_shape
+        if image.shape[1:] not in shapes:
+            expected = " or embedded ones ".join(f"[B, {str(s)[1:-1]}]" for s in shapes)
+            raise UserError(f"image has shape {list(image.shape)}, expected {expected}")
+        if image.dtype != np.uint8 and not jnp.issubdtype(image.dtype, jnp.floating):
+            raise UserError(f"image has dtype {image.dtype}, expected uint8")
+        return image, has_image
+
+    def _cameras(self, camera: Any, num_frames: int, options: CameraOptions) -> Camera:
+        """Combine the cameras of all frames into one batched `Camera`."""
+        if isinstance(camera, Camera) and np.ndim(camera.is_valid) == 1:
+            return camera
+        if not isinstance(camera, list | tuple):
+            camera = [camera] * num_frames
+        none = no_camera(self.model.options.image.size)
+        return stack_cameras(
+            [none if one is None else _one_camera(one, options) for one in camera]
+        )
+
+
+def _one_camera(camera: Camera | Calibration, options: CameraOptions) -> Camera:
+    if isinstance(camera, Camera):
+        return camera
+    if not isinstance(camera, CameraCalibration):
+        path = as_path(camera)
+        camera = CameraCalibration.from_kradar(
+            path, radar_from_lidar_m=_KRADAR_FROM_LIDAR_M
+        )
+        camera.require_view_ahead(path)
+    own_m = camera.radar_from_lidar_m
+    shift_m = np.array(options.shift(own_m, own_m[2]))
+    camera = dataclasses.replace(camera, radar_from_lidar_m=shift_m)
+    return camera.camera(options.projection)
+
+
+def _read_paths(given: Any, read: Callable[[pathlib.Path, int], np.ndarray]) -> Any:
+    """Replace paths by the arrays that they contain.
+
+    An array is returned unchanged. A path or a list becomes a list of arrays and None.
+    `read` is called with the path and its position in the list.
+    """
+    if not isinstance(given, str | os.PathLike | Sequence):
+        return given
+    entries = [given] if isinstance(given, _PATH) else given
+    return [
+        read(as_path(entry), index) if isinstance(entry, _PATH) else entry
+        for index, entry in enumerate(entries)
+    ]
+
+
+def as_numbers(values: Any, name: str) -> Any:
+    """Convert an array of any kind of real numbers to one that JAX accepts.
+
+    Args:
+        values: Array; those on a device are returned unchanged.
+        name: Name of the array for the error message.
+
+    Raises:
+        UserError: The values are masked, or are not real numbers.
+    """
+    if isinstance(values, jax.Array):
+        return values
+    if np.ma.is_masked(values):
+        count = np.ma.count_masked(values)
+        raise UserError(
+            f"{name}: {count} values are masked; fill them: array.filled(x)"
+        )
+    array = np.asarray(values)
+    if array.dtype == object:
+        with contextlib.suppress(TypeError, ValueError):
+            array = array.astype(np.float64)
+    if not (array.dtype.kind in "iu" or jnp.issubdtype(array.dtype, jnp.floating)):
+        raise UserError(f"{name}: array of {array.dtype}, expected real numbers")
+    return array.astype(array.dtype.newbyteorder("="), copy=False)
+
+
+def check_backbone(
+    image: Real[Array, "B _ _ _"] | None, variables: Mapping[str, Any]
+) -> None:
+    """Check that the variables contain the image backbone if images require it.
+
+    Args:
+        image: Images `[B, H, W, 3]`, embedded images, or None.
+        variables: Variables of the model.
+
+    Raises:
+        UserError: Images are given, and the weights of the image backbone are missing.
+    """
+    is_raw = image is not None and image.shape[-1] == 3
+    if is_raw and IMAGE_BACKBONE not in variables["params"]:
+        raise UserError(
+            "these weights are without the image backbone: give image_backbone=FOLDER "
+            "(--image-backbone FOLDER) with the weights of DINOv3, or embedded images"
+        )
+
+
+# Settings ----------------------------------------------------------------------------
+
+UNBOUNDED_ROI = (-np.inf, np.inf, -np.inf, np.inf, -np.inf, np.inf)
+
+
+class Settings(NamedTuple):
+    """The values of a call that can change without recompilation, see `decode`."""
+
+    score_threshold: Float[Array, ""]
+    nms_iou: Float[Array, ""]
+    roi: Float[Array, "6"]
+
+    @classmethod
+    def of(cls, options: DecodeOptions, changes: dict[str, Any]) -> Settings:
+        """Return the values of options, and those that replace them, as float32 arrays."""
+        values = dict(options) | changes
+        return cls(
+            score_threshold=np.asarray(values["score_threshold"], np.float32),
+            nms_iou=np.asarray(values["nms_iou"], np.float32),
+            roi=np.asarray(values["roi"] or UNBOUNDED_ROI, np.float32),
+        )
+
+
+def check_settings(
+    score_threshold: float | None,
+    nms_iou: float | None,
+    roi: Sequence[float] | str | None,
+) -> dict[str, Any]:
+    """Return the given values as fields of `DecodeOptions`, without those that are None.
+
+    Raises:
+        UserError: A value is out of its range.
+    """
+    given = {"score_threshold": score_threshold, "nms_iou": nms_iou}
+    settings: dict[str, Any] = {k: float(v) for k, v in given.items() if v is not None}
+    for name, value in settings.items():
+        require(0 <= value <= 1, name, value, "a number from 0 to 1")
+    if roi is not None:
+        limits = ROIS.get(roi, ()) if isinstance(roi, str) else tuple(roi)
+        require(is_roi(limits), "roi", roi, f"narrow, wide or {ROI_LIMITS}")
+        settings["roi"] = limits
+    return settings
+
+
+# Values that cannot be radar power ---------------------------------------------------
+
+
+class Extremes(NamedTuple):
+    """Extreme values of B frames, by which invalid frames are found.
+
+    Attributes:
+        lowest: Smallest value of each frame, or -inf if it contains NaN or values below
+            the valid ones.
+        beams: Maximum over range (and Doppler) of each frame.
+    """
+
+    lowest: Float[Array, " B"]
+    beams: Real[Array, "B _ _"]
+
+
+def extremes(frames: Real[jax.Array, "B ..."]) -> Extremes:
+    """Compute the extreme values of projections or tensors; may be jitted."""
+    are_tensors = frames.ndim == 5
+    axes = tuple(range(1, frames.ndim))
+    # On a CPU, the compiler's minimum and maximum can ignore NaN; comparisons do not.
+    is_valid = (frames >= (0 if are_tensors else -MAX_LEVEL)).all(axes)
+    lowest = jnp.where(is_valid, frames.min(axes).astype(jnp.float32), -jnp.inf)
+    return Extremes(lowest, frames.max(axis=(1, 2) if are_tensors else 1))
+
+
+def find_problems(of_frames: Extremes, *, are_tensors: bool) -> list[str]:
+    """Describe why frames cannot be linear power or levels of a projection.
+
+    Args:
+        of_frames: Extreme values of the frames on the host.
+        are_tensors: Whether the frames are tensors of linear power.
+
+    Returns:
+        One description for every invalid frame, see `projection.find_problem`.
+    """
+    problems = []
+    for lowest, beams in zip(*of_frames, strict=True):
+        beams = beams.astype(np.float64)
+        if are_tensors:
+            with np.errstate(invalid="ignore"):  # the logarithm of a negative maximum
+                problems.append(find_problem(to_log_scale(beams), float(lowest)))
+        else:
+            problems.append(find_problem(beams, -1.0 if np.isneginf(lowest) else 0.0))
+    return [problem for problem in problems if problem]
