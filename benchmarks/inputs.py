@@ -80,12 +80,10 @@ def frames_of(size, **camera):
 def simulator_of(weather="rain"):
     """Returns the arrays of one frame of the simulated radar, and the simulating function."""
     options = SimulationOptions(**FULL_SIZE)
-    sequence = make_sequence(
-        1, environment="urban", time="day", weather=weather, num_frames=1,
-        rng=np.random.default_rng(len(weather)),
-    )  # fmt: skip
+    rng = np.random.default_rng(len(weather))
+    sequence = make_sequence(1, ("urban", "day", weather), 1, rng)
     grid, parameters = options.make_grid(), options.make_parameters()
-    simulator = SequenceSimulator(sequence, grid, parameters, seed=0)
+    simulator = SequenceSimulator(sequence, options)
     arrays = simulator.radar_input(sequence.frame(0)).arrays
     return arrays, functools.partial(tensor.simulate, grid=grid, parameters=parameters)
 

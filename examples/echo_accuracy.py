@@ -56,9 +56,7 @@ def measured(
     grid, source = options.make_grid(), make_source(options)
     doppler_step = grid.doppler_mps[1] - grid.doppler_mps[0]
     for name in source.numbers:
-        simulator = SequenceSimulator(
-            source.make(name), grid, options.make_parameters(), options.seed
-        )
+        simulator = SequenceSimulator(source.make(name), options)
         frame = simulator.sequence.frame(0)
         given = simulator.radar_input(frame)
         doppler = simulator.run(given, "projection")[..., : grid.num_doppler]

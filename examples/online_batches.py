@@ -99,9 +99,7 @@ class OnlineBatches:
         return [f"{number}/{spec.name}" for number, spec in self._specs]
 
     def _make_simulator(self, number: int) -> SequenceSimulator:
-        return SequenceSimulator(
-            self._source.make(number), self.grid, self._parameters, self._options.seed
-        )
+        return SequenceSimulator(self._source.make(number), self._options)
 
     def _frame(self, index: int, step: int, row: int):
         """Returns index, radar input, noise key, boxes `[n, 7]` and classes `[n]` of a frame.

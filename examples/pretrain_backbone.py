@@ -107,8 +107,7 @@ def draw(
             "simulation.scenes must be procedural and simulation.image_width above 0"
         )
     height, width = options.image_height, options.image_width
-    cameras = stereo_calibration(options.radar_from_lidar_m, width, height)
-    origin = camera_position(cameras[0])
+    origin = camera_position(stereo_calibration(options)[0])
     source = make_source(options)
     shape = (count, height // patch, width // patch)
     images = Images(
@@ -124,13 +123,7 @@ def draw(
 
     def draw_one(index: int) -> None:
         sequence = with_small_ones(source.make(index + 1), share, seed)
-        renderer = CameraRenderer(
-            sequence,
-            cameras,
-            seed,
-            cover_lens=options.cover_lens,
-            mode=options.camera_mode,
-        )
+        renderer = CameraRenderer(sequence, options)
         frame = sequence.frame(0)
         box = renderer.shown_boxes(frame, 0)
         cls = np.append(frame.cls, -1)[box]  # -1 where there is no box

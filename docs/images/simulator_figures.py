@@ -12,8 +12,8 @@ from matplotlib.lines import Line2D
 
 from radejax.core.structures import CLASSES
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibration
-from radejax.simulation.config import RadarOptions
+from radejax.simulation.camera.renderer import CameraRenderer
+from radejax.simulation.config import FULL_SIZE, SimulationOptions
 from radejax.simulation.simulator import SequenceSimulator
 from radejax.simulation.world.traffic import make_sequence
 from radejax.visualize.draw import draw_map
@@ -35,9 +35,7 @@ SCENES = (
     ("lightsnow", "university", "day", 2),
     ("heavysnow", "highway", "day", 1),
 )
-OFFSET = (-2.54, 0.3, 0.7)
 GRID = RadarGrid.kradar()
-PARAMETERS = RadarOptions().make_parameters()
 LIMITS_DB = (112, 145)  # from the noise to the echoes of cars
 ANGLE_LIMITS_DB = (120, 165)  # the maximum over ranges comes mostly from near objects
 SEEN = {"color": "white", "lw": 1.0, "ls": "-"}
@@ -53,17 +51,16 @@ UNSEEN = {"color": "#E69F00", "lw": 1.2, "ls": (0, (3, 1))}
 
 def draw(weather, environment, time, seed, path):
     """Draw camera image, range-azimuth, azimuth-elevation and range-Doppler maps."""
-    sequence = make_sequence(
-        seed, environment=environment, time=time, weather=weather, num_frames=60,
-        rng=np.random.default_rng(seed),
-    )  # fmt: skip
-    simulator = SequenceSimulator(sequence, GRID, PARAMETERS, seed)
+    rng = np.random.default_rng(seed)
+    sequence = make_sequence(seed, (environment, time, weather), 60, rng)
+    simulator = SequenceSimulator(sequence, SimulationOptions(**FULL_SIZE, seed=seed))
     frame = sequence.frame(30)
     given = simulator.radar_input(frame)
     power_db = 10 * np.log10(simulator.run(given, "tesseract") + 1e-10)  # [D, R, E, A]
-    renderer = CameraRenderer(
-        sequence, stereo_calibration(OFFSET, 640, 360), 0, cover_lens=weather == "sleet"
+    options = SimulationOptions(
+        image_width=640, image_height=360, cover_lens=weather == "sleet"
     )
+    renderer = CameraRenderer(sequence, options)
     figure = new_figure(14, 3.3, layout="constrained")
     axes = figure.subplots(1, 4, width_ratios=(1.75, 1.25, 1, 1))
     axes[0].imshow(renderer.render(frame)[:, :640])
@@ -147,11 +144,10 @@ def draw_statistics(path):
     """Draw mean power of one frame, and profiles and echoes of all scenes beside K-Radar's."""
     levels = []
     for weather, environment, time, seed in SCENES:
-        sequence = make_sequence(
-            seed, environment=environment, time=time, weather=weather, num_frames=2,
-            rng=np.random.default_rng(seed),
-        )  # fmt: skip
-        simulator = SequenceSimulator(sequence, GRID, PARAMETERS, seed)
+        rng = np.random.default_rng(seed)
+        sequence = make_sequence(seed, (environment, time, weather), 2, rng)
+        options = SimulationOptions(**FULL_SIZE, seed=seed)
+        simulator = SequenceSimulator(sequence, options)
         given = simulator.radar_input(sequence.frame(0))
         power = simulator.run(given, "tesseract").mean((0, 2), dtype=np.float64)
         levels.append(10 * np.log10(power))

@@ -216,7 +216,8 @@ class SimulationOptions(Options, section="config.simulation"):
             grid = make(**self.grid.model_dump(exclude_none=True))
         except ValueError as error:
             raise UserError(f"config.simulation.grid: {error}") from None
-        doppler, name = grid.doppler_mps, "config.simulation.grid.doppler_mps"
+        doppler = grid.doppler_mps
+        name = "config.simulation.grid.doppler_mps"
         require(is_uniform(doppler), name, doppler.tolist(), "uniform bins of an FFT")
         return grid
 

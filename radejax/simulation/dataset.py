@@ -17,7 +17,7 @@ import logging
 import os
 import pathlib
 import pickle
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator
 from typing import Any, TypeVar
 
 import jax
@@ -31,7 +31,6 @@ from radejax.core.workers import default_workers, process_pool
 from radejax.data.kradar import write as kradar_write
 from radejax.data.kradar.folders import SIMULATION_MARKER
 from radejax.data.kradar.labels import Label
-from radejax.geometry.camera import CameraCalibration
 from radejax.simulation.camera.renderer import CameraRenderer, stereo_calibration
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.radar import tensor
@@ -84,15 +83,20 @@ def simulate_dataset(
         _log.info("Simulated dataset %s is complete: reused.", root)
         return root
     source = make_source(options)
-    num_frames, size = expected_size(options, source)
-    _log.info("%s: %d frames, about %.2g GB", root, num_frames, size / 1e9)
+    total, size = expected_size(options, source)
+    _log.info("%s: %d frames, about %.2g GB", root, total, size / 1e9)
     content = _marker(options)
     with files.disk_full(root / SIMULATION_MARKER):
         files.write_json(root / SIMULATION_MARKER, content)
         files.remove_stale(root)
         writer = Writer(root, options, source)
-        writer.write_common()
-        writer.write_frames(num_workers, progress)
+        missing = writer.write_common()
+        if num_workers is None:
+            is_small = len(missing) <= _FEW_FRAMES
+            num_workers = 0 if is_small else default_workers()
+        with tqdm(None, "simulate", total, unit="frame", disable=not progress) as bar:
+            bar.update(total - len(missing))
+            writer.write_frames(missing, num_workers, bar)
         files.write_json(root / SIMULATION_MARKER, content | {"finished": True})
     return root
 
@@ -144,59 +148,14 @@ class Writer:
         self, root: pathlib.Path, options: SimulationOptions, source: SceneSource
     ) -> None:
         self.root, self.options, self.source = root, options, source
-        self.grid, self.parameters = options.make_grid(), options.make_parameters()
-        self.cameras: tuple[CameraCalibration, ...] = ()  # left and right
-        if options.image_width:
-            size = options.image_width, options.image_height
-            self.cameras = stereo_calibration(options.radar_from_lidar_m, *size)
 
-    def write_common(self) -> None:
-        """Writes the splits, the sensor axes and the camera calibrations."""
+    def write_common(self) -> list[FrameSpec]:
+        """Writes everything but frames, and returns the frames without a label file."""
+        missing: list[FrameSpec] = []
         names: dict[str, list[tuple[int, str]]] = {"train": [], "test": []}
         for number in self.source.numbers:
-            for spec in self.source.frames(number):
-                names[spec.split].append((number, spec.name))
-        kradar_write.write_splits(self.root / "split", **names)
-        if self.options.grid != "kradar":
-            kradar_write.write_grid(self.root, self.grid)
-        for index, calibration in enumerate(self.cameras):
-            path = self.root / "calib" / "common" / f"cam_front{index}.yml"
-            files.write_text(path, calibration.to_kradar_text())
-
-    def write_frames(self, num_workers: int | None, progress: bool) -> None:
-        """Writes every frame that does not exist yet."""
-        missing = list(self._missing())
-        total = sum(len(self.source.frames(n)) for n in self.source.numbers)
-        if num_workers is None:
-            is_small = len(missing) <= _FEW_FRAMES
-            num_workers = 0 if is_small else default_workers()
-        compute = functools.partial(
-            tensor.simulate,
-            grid=self.grid,
-            parameters=self.parameters,
-            output=self.options.output,
-        )
-        with (
-            tqdm(None, "simulate", total, unit="frame", disable=not progress) as bar,
-            contextlib.closing(self._prepared(num_workers, missing)) as frames,
-        ):
-            bar.update(total - len(missing))
-            computed = (
-                (number, spec, compute(*given.arrays), labels)
-                for number, spec, given, labels in frames
-            )
-            # The device computes the next frame while this one is written.
-            for frame in _started_ahead(computed, 1):
-                self.write_frame(*frame)
-                bar.update()
-
-    def _missing(self) -> Iterator[tuple[int, FrameSpec]]:
-        """Yields the frames without a label file, and writes the files of each sequence.
-
-        These files are the description and the calibration.
-        """
-        for number in self.source.numbers:
-            folder, specs = self.root / str(number), self.source.frames(number)
+            folder = self.root / str(number)
+            specs = self.source.frames(number)
             conditions = self.source.conditions(number)
             kradar_write.write_description(folder / "description.txt", *conditions)
             radar_idx, lidar_idx, *_ = specs[0].indices
@@ -204,13 +163,41 @@ class Writer:
             shift_m = self.options.radar_from_lidar_m[:2]
             kradar_write.write_calibration(path, radar_idx - lidar_idx, *shift_m)
             there = {path.stem for path in (folder / _LABELS).glob("*.txt")}
-            yield from ((number, spec) for spec in specs if spec.name not in there)
+            missing += [spec for spec in specs if spec.name not in there]
+            for spec in specs:
+                names[spec.split].append((number, spec.name))
+        kradar_write.write_splits(self.root / "split", **names)
+        if self.options.grid != "kradar":
+            kradar_write.write_grid(self.root, self.options.make_grid())
+        if self.options.image_width:
+            for index, calibration in enumerate(stereo_calibration(self.options)):
+                path = self.root / "calib" / "common" / f"cam_front{index}.yml"
+                files.write_text(path, calibration.to_kradar_text())
+        return missing
+
+    def write_frames(self, missing: list[FrameSpec], num_workers: int, bar) -> None:
+        """Writes the missing frames, and advances a progress bar."""
+        compute = functools.partial(
+            tensor.simulate,
+            grid=self.options.make_grid(),
+            parameters=self.options.make_parameters(),
+            output=self.options.output,
+        )
+        with contextlib.closing(self._prepared(num_workers, missing)) as frames:
+            computed = (
+                (spec, compute(*given.arrays), labels) for spec, given, labels in frames
+            )
+            # The device computes the next frame while this one is written.
+            for frame in _started_ahead(computed, 1):
+                self.write_frame(*frame)
+                bar.update()
 
     def write_frame(
-        self, number: int, spec: FrameSpec, output: jax.Array, labels: list[Label]
+        self, spec: FrameSpec, output: jax.Array, labels: list[Label]
     ) -> None:
         """Writes the radar data of one frame, then its labels."""
-        folder, index = self.root / str(number), spec.indices[0]
+        folder = self.root / str(spec.sequence)
+        index = spec.indices[0]
         if self.options.output == "tesseract":
             path = folder / "radar_tesseract" / f"tesseract_{index:05d}.mat"
             tesseract = np.asarray(output).transpose(tensor.TESSERACT_OF_ROWS)
@@ -222,22 +209,18 @@ class Writer:
         path = folder / _LABELS / f"{spec.name}.txt"
         kradar_write.write_labels(path, spec.indices, spec.timestamp_s, labels)
 
-    def prepare(self, number: int, spec: FrameSpec) -> tuple[RadarInput, list[Label]]:
+    def prepare(self, spec: FrameSpec) -> tuple[RadarInput, list[Label]]:
         """Computes radar input and labels of one frame and writes its image."""
-        options, camera_idx = self.options, spec.indices[2]
-        simulator, renderer = self._sequence(number)
+        simulator, renderer = self._sequence(spec.sequence)
         frame = simulator.sequence.frame(spec.scene_idx)
         if renderer:
-            name = f"cam-front_{camera_idx:05d}.png"
-            path = self.root / str(number) / "cam-front" / name
+            name = f"cam-front_{spec.indices[2]:05d}.png"
+            path = self.root / str(spec.sequence) / "cam-front" / name
             with files.atomic_write(path) as file:
                 image = Image.fromarray(renderer.render(frame))
                 image.save(file, format="PNG", compress_level=1)  # for speed
         given = simulator.radar_input(frame)
-        labels = simulator.labels(
-            frame, given, options.radar_from_lidar_m, options.label_distance_m
-        )
-        return given, labels
+        return given, simulator.labels(frame, given)
 
     @functools.cached_property
     def _sequence(self) -> Callable[[int], tuple[SequenceSimulator, Any]]:
@@ -245,37 +228,29 @@ class Writer:
         return functools.lru_cache(maxsize=2)(self._make)
 
     def _make(self, number: int) -> tuple[SequenceSimulator, CameraRenderer | None]:
-        options, sequence = self.options, self.source.make(number)
-        simulator = SequenceSimulator(
-            sequence, self.grid, self.parameters, options.seed
-        )
-        if not self.cameras:
-            return simulator, None
-        cover_lens, mode = options.cover_lens, options.camera_mode
-        renderer = CameraRenderer(
-            sequence, self.cameras, options.seed, cover_lens=cover_lens, mode=mode
-        )
-        return simulator, renderer
+        sequence = self.source.make(number)
+        is_shown = self.options.image_width > 0
+        renderer = CameraRenderer(sequence, self.options) if is_shown else None
+        return SequenceSimulator(sequence, self.options), renderer
 
     def _prepared(
-        self, num_workers: int, missing: Sequence[tuple[int, FrameSpec]]
-    ) -> Generator[tuple[int, FrameSpec, RadarInput, list[Label]], None, None]:
-        """Yields the sequence number, frame, radar input and labels of each frame, in order.
+        self, num_workers: int, missing: list[FrameSpec]
+    ) -> Generator[tuple[FrameSpec, RadarInput, list[Label]], None, None]:
+        """Yields each frame with its radar input and labels, in order.
 
         The generator starts `num_workers` processes, or uses this process if it is 0.
         Closing the generator ends the processes.
         """
         if not num_workers:
-            for frame in missing:
-                yield (*frame, *self.prepare(*frame))
+            yield from ((spec, *self.prepare(spec)) for spec in missing)
             return
         with process_pool(num_workers, _start_worker, self) as submit:
-            started = ((frame, submit(_prepare_in_worker, *frame)) for frame in missing)
-            for frame, future in _started_ahead(started, 2 * num_workers):
+            started = ((spec, submit(_prepare_in_worker, spec)) for spec in missing)
+            for spec, future in _started_ahead(started, 2 * num_workers):
                 path = pathlib.Path(future.result())
-                given, labels = pickle.loads(path.read_bytes())
+                prepared = pickle.loads(path.read_bytes())
                 path.unlink()
-                yield (*frame, given, labels)
+                yield (spec, *prepared)
 
 
 def _started_ahead(items: Iterator[_T], count: int) -> Iterator[_T]:
@@ -299,11 +274,11 @@ def _start_worker(writer: Writer) -> None:
     _writer = writer
 
 
-def _prepare_in_worker(number: int, spec: FrameSpec) -> str:
+def _prepare_in_worker(spec: FrameSpec) -> str:
     """Prepares one frame, writes the result to a file and returns the path of the file.
 
     The result itself is too large to be returned by a worker.
     """
-    path = _writer.root / f".{number}_{spec.name}.tmp"
-    path.write_bytes(pickle.dumps(_writer.prepare(number, spec)))
+    path = _writer.root / f".{spec.sequence}_{spec.name}.tmp"
+    path.write_bytes(pickle.dumps(_writer.prepare(spec)))
     return str(path)

@@ -16,7 +16,6 @@ from radejax.core.errors import UserError
 from radejax.data.kradar import Frame, KRadar
 from radejax.data.kradar.folders import split_by_rule
 from radejax.data.kradar.labels import Label, LabelHeader
-from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.radar import propagation, scattering, sensor, tensor
 from radejax.simulation.world import scene
@@ -64,64 +63,55 @@ class SequenceSimulator:
 
     Args:
         sequence: Scene of the sequence.
-        grid: Axes of the radar.
-        parameters: Parameters of the radar other than its axes, some of which each
-            sequence draws.
-        seed: Seed of scattering centers, phases, noise and drawn parameters, in addition to
-            the number of the sequence and the index of the frame.
+        options: Options of the dataset. Their seed and the numbers of sequence and frame
+            determine scattering centers, phases, noise and drawn parameters of the radar.
     """
 
-    def __init__(
-        self,
-        sequence: Sequence,
-        grid: RadarGrid,
-        parameters: tensor.RadarParameters,
-        seed: int,
-    ) -> None:
-        self.sequence, self.grid = sequence, grid
-        self.parameters, self.seed = parameters, seed
-        rng = np.random.default_rng([seed, sequence.name, 11])
+    def __init__(self, sequence: Sequence, options: SimulationOptions) -> None:
+        self.sequence, self.options = sequence, options
+        self.grid, self.parameters = options.make_grid(), options.make_parameters()
+        rng = np.random.default_rng([options.seed, sequence.name, 11])
         tracks = sequence.tracks
         sizes_m = np.median(tracks.size_m, axis=0)
         self._centers = scattering.make_object_scatterers(tracks.cls, sizes_m, rng)
         count = len(sequence.reflectors.kind)
         self._static_phase = rng.uniform(0.0, 2.0 * np.pi, count)
-        rng = np.random.default_rng([seed, sequence.name, 13])
-        self.drawn = parameters.draw(rng, grid.num_doppler)
-        self._state = sensor.draw_state(grid, self.drawn, rng)
+        rng = np.random.default_rng([options.seed, sequence.name, 13])
+        self.drawn = self.parameters.draw(rng, self.grid.num_doppler)
+        self._state = sensor.draw_state(self.grid, self.drawn, rng)
 
     def radar_input(self, frame: SceneFrame) -> RadarInput:
         """Computes scatterers and noise of a frame as NumPy input of `tensor.simulate`."""
-        sequence, parameters = self.sequence, self.drawn
+        sequence = self.sequence
+        weather = sequence.weather
+        parameters = self.drawn
+        wavelength_m = parameters.wavelength_m
         objects, lit = scattering.scatter_objects(frame, self._centers, parameters)
         static = scattering.scatter_surroundings(frame, self._static_phase, parameters)
         ghosts = scattering.scatter_ghosts(objects, sequence.mirrors_m)
         kinds = zip(objects, static, ghosts, strict=True)
         found = scattering.FrameScattering(*map(np.concatenate, kinds))
-        surface = propagation.WEATHERS[sequence.weather].surface
-        bounce = propagation.bounce(
-            found.position_m, sequence.ground_m, surface, parameters.wavelength_m
-        )
+        surface = propagation.WEATHERS[weather].surface
+        position = found.position_m
+        bounce = propagation.bounce(position, sequence.ground_m, surface, wavelength_m)
         # The cross-section of the ground already includes its reflections.
         is_ground = frame.reflectors.kind == scene.REFLECTOR_KINDS.index("ground")
         count = len(objects.power)
         bounce[count : count + len(is_ground)][is_ground] = 1.0
-        distance = np.linalg.norm(found.position_m, axis=1)
-        air = propagation.attenuation(sequence.weather, distance)
+        distance = np.linalg.norm(position, axis=1)
+        air = propagation.attenuation(weather, distance)
         found = found._replace(
             power=found.power * air * np.square(np.abs(bounce)),
             phase_rad=found.phase_rad + np.angle(bounce),
         )
         power = np.bincount(objects.owner, found.power[:count], len(frame.boxes))
         noise_db = parameters.noise_db + parameters.receiver_db
+        ego_mps = frame.ego_velocity_mps
+        noise = propagation.noise_profile(weather, self.grid, parameters, ego_mps)
         return RadarInput(
-            scatterers=scattering.to_scatterers(
-                found, frame.ego_velocity_mps, parameters.wavelength_m
-            ),
-            noise_power=propagation.noise_profile(
-                sequence.weather, self.grid, parameters, frame.ego_velocity_mps
-            ),
-            key=tensor.frame_key(self.seed, sequence.name, frame.index),
+            scatterers=scattering.to_scatterers(found, ego_mps, wavelength_m),
+            noise_power=noise,
+            key=tensor.frame_key(self.options.seed, sequence.name, frame.index),
             state=self._state,
             snr_db=10.0 * np.log10(power + 1e-30) - noise_db,
             lit=lit,
@@ -147,27 +137,15 @@ class SequenceSimulator:
         inside = self.grid.in_field_of_view(frame.boxes[:, 0], frame.boxes[:, 1])
         return inside & (given.snr_db > MIN_SNR_DB) & (given.lit > MIN_LIT)
 
-    def labels(
-        self,
-        frame: SceneFrame,
-        given: RadarInput,
-        radar_from_lidar_m: tuple[float, float, float],
-        max_distance_m: float,
-    ) -> list[Label]:
-        """Returns the labels of one frame in the LiDAR frame, as in K-Radar's files.
-
-        Args:
-            frame: Scene of the frame.
-            given: Radar input of the same frame.
-            radar_from_lidar_m: Translation t of `p_radar = p_lidar + t`.
-            max_distance_m: Distance from which on objects get no label.
-        """
+    def labels(self, frame: SceneFrame, given: RadarInput) -> list[Label]:
+        """Returns the labels of one frame in the LiDAR frame, as in K-Radar's files."""
         visible = self.is_radar_visible(frame, given)
         distance = np.hypot(frame.boxes[:, 0], frame.boxes[:, 1])
-        labels, tracks = [], self.sequence.tracks
-        for n in np.flatnonzero(distance < max_distance_m):
+        tracks = self.sequence.tracks
+        labels = []
+        for n in np.flatnonzero(distance < self.options.label_distance_m):
             box = frame.boxes[n].copy()
-            box[:3] -= radar_from_lidar_m
+            box[:3] -= self.options.radar_from_lidar_m
             track = frame.track[n]
             cls, track_id = tracks.label_cls[track], int(tracks.track_id[track])
             visibility = "R" if visible[n] else "L"
@@ -182,6 +160,7 @@ class FrameSpec(NamedTuple):
     """One frame of a dataset before it is simulated.
 
     Attributes:
+        sequence: Number of the sequence.
         scene_idx: Index of the frame in the scene of the sequence.
         indices: Frame numbers of radar, LiDAR OS2-64, front camera, LiDAR OS1-128 and
             the other cameras, as in the header of the label file.
@@ -189,8 +168,9 @@ class FrameSpec(NamedTuple):
         split: "train" or "test".
     """
 
+    sequence: int
     scene_idx: int
-    indices: tuple[int, int, int, int, int]
+    indices: tuple[int, ...]
     timestamp_s: float
     split: str
 
@@ -215,28 +195,23 @@ class ProceduralSource:
         radar, camera, long_lidar, others = map(int, rng.integers(1, 42, size=4))
         split = "train" if number <= options.train_sequences else "test"
         start = _FIRST_TIMESTAMP_S + 1000.0 * number
-        return [
-            FrameSpec(
-                scene_idx=i,
-                indices=(n + radar, n, n + camera, n + long_lidar, n + others),
-                timestamp_s=start + scene.FRAME_PERIOD_S * i,
-                split=split,
-            )
-            for i, n in enumerate(range(1, options.frames_per_sequence + 1))
-        ]
+        specs = []
+        for i in range(options.frames_per_sequence):
+            offsets = radar, 0, camera, long_lidar, others
+            indices = tuple(i + 1 + offset for offset in offsets)
+            timestamp_s = start + scene.FRAME_PERIOD_S * i
+            specs.append(FrameSpec(number, i, indices, timestamp_s, split))
+        return specs
 
     def make(self, number: int) -> Sequence:
         """Creates the scene of the sequence `number`."""
-        options, (environment, time, weather) = self._options, self.conditions(number)
+        options = self._options
+        rng = np.random.default_rng([options.seed, number])
         is_training = number <= options.train_sequences
+        scale = options.vru_density_scale if is_training else 1.0
+        conditions = self.conditions(number)
         return make_sequence(
-            number,
-            environment=environment,
-            time=time,
-            weather=weather,
-            num_frames=options.frames_per_sequence,
-            vru_density_scale=options.vru_density_scale if is_training else 1.0,
-            rng=np.random.default_rng([options.seed, number]),
+            number, conditions, options.frames_per_sequence, rng, scale
         )
 
 
@@ -261,14 +236,15 @@ class LabelSource:
             raise UserError(f"{options.scenes}: no frames of the chosen sequences")
         self.numbers = sorted(self._frames)
 
-    def conditions(self, number: int) -> tuple[str, str, str]:
+    def conditions(self, number: int) -> scene.Conditions:
         """Returns environment, time and weather of the sequence `number`."""
         frame = self._frames[number][0]
         return frame.environment, frame.time, frame.weather
 
     def frames(self, number: int) -> list[FrameSpec]:
         """Returns the frames of the sequence `number`, in order."""
-        options, frames = self._options, self._frames[number]
+        options = self._options
+        frames = self._frames[number]
         names = [f.name for f in frames]
         train = set(split_by_rule(names, "train"))
         chosen = range(0, len(frames), options.frame_stride)
@@ -279,26 +255,22 @@ class LabelSource:
             first_test = is_test.index(True) if True in is_test else 0
             start = first_test - (count + 1) // 2 if count <= first_test else 0
             chosen = chosen[start : start + count]
-        return [
-            FrameSpec(
-                scene_idx=index,
-                indices=_header_indices(frames[index].header),
-                timestamp_s=frames[index].header.timestamp_s,
-                split="train" if names[index] in train else "test",
-            )
-            for index in chosen
-        ]
+        specs = []
+        for index in chosen:
+            header = frames[index].header
+            indices = _header_indices(header)
+            split = "train" if names[index] in train else "test"
+            specs.append(FrameSpec(number, index, indices, header.timestamp_s, split))
+        return specs
 
     def make(self, number: int) -> Sequence:
         """Creates the scene of the sequence `number`."""
-        return make_real_sequence(
-            self._frames[number],
-            radar_from_lidar_m=self._options.radar_from_lidar_m,
-            rng=np.random.default_rng([self._options.seed, number]),
-        )
+        rng = np.random.default_rng([self._options.seed, number])
+        shift_m = self._options.radar_from_lidar_m
+        return make_real_sequence(self._frames[number], shift_m, rng)
 
 
-def _header_indices(header: LabelHeader) -> tuple[int, int, int, int, int]:
+def _header_indices(header: LabelHeader) -> tuple[int, ...]:
     """Returns the frame numbers of a `FrameSpec`.
 
     Sensors that are missing in old labels get the frame number of the LiDAR.

@@ -16,6 +16,7 @@ from radejax.data.cameras import (
 from radejax.data.kradar import Frame
 from radejax.geometry.camera import CameraCalibration, project
 from radejax.simulation.camera.renderer import stereo_calibration
+from radejax.simulation.config import FULL_SIZE, SimulationOptions
 
 CALIBRATION = CameraCalibration.from_angles(
     intrinsics=(60.0, 58.0, 32.0, 16.0),
@@ -73,7 +74,7 @@ def test_cameras_project_as_their_calibration(frames):
 
 def test_boxes_have_no_say_in_the_height_that_queries_start_at(frames):
     """How far too high they would look without it, in pixels of K-Radar's image."""
-    calibration = stereo_calibration((-2.54, 0.3, 0.7))[0]
+    calibration = stereo_calibration(SimulationOptions(**FULL_SIZE))[0]
     with open(frames[0].camera_calibration_path, "w") as file:
         file.write(calibration.to_kradar_text())
     ahead = np.array([[10.0, 0.0, 0.0], [20.0, 0.0, 0.0]])

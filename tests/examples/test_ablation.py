@@ -186,12 +186,12 @@ def test_every_cell_is_a_config_and_its_command_makes_it(table: str) -> None:
     for name, cell in study.cells.items():
         config = work.config(cell, 2)
         words = work.command(name, 2).split()
-        again = load_config(
-            str(ablation.CONFIGS.parent / words[words.index("--config") + 1])
+        file = ablation.CONFIGS.parent / words[words.index("--config") + 1]
+        again = load_config(str(file))
+        given = (
+            word.removeprefix("--config.") for word in words if "--config." in word
         )
-        texts = dict(
-            w[len("--config.") :].split("=") for w in words if "--config." in w
-        )
+        texts = dict(text.split("=") for text in given)
         assert with_texts(again, texts) == config
         if not cell.exchanges:
             seen.append((config.model_dump_json(), cell.release))
@@ -243,19 +243,15 @@ def test_releases_are_made_of_the_tensors_of_the_same_scenes(
 @pytest.mark.parametrize("table", sorted(ablation.STUDIES))
 def test_documented_numbers_are_those_of_the_table_beside(table: str) -> None:
     docs = ablation.CONFIGS.parent / "docs"
-    content = json.loads(
-        (docs / "reports" / "ablations" / f"table_{table}.json").read_text()
-    )
+    stored = docs / "reports" / "ablations" / f"table_{table}"
+    content = json.loads(stored.with_suffix(".json").read_text())
     page = (docs / "results.md").read_text()
-    markdown = (docs / "reports" / "ablations" / f"table_{table}.md").read_text()
-    claims = [
-        [cell.strip() for cell in line.strip("|").split("|")]
-        for line in markdown.splitlines()
-    ]
+    markdown = stored.with_suffix(".md").read_text()
+    lines = (line.strip("|").split("|") for line in markdown.splitlines())
+    claims = [[cell.strip() for cell in line] for line in lines]
     study = ablation.STUDIES[table]
-    rows = {
-        (r["cell"], r["cls"]): r for r in content["rows"] if r["condition"] == "all"
-    }
+    whole = [row for row in content["rows"] if row["condition"] == "all"]
+    rows = {(row["cell"], row["cls"]): row for row in whole}
     for cell in study.cells:
         assert rows[cell, "mean"]["seeds"] == [0, 1, 2]
         aps = [f"{rows[cell, cls]['ap']:.1f}" for cls in (*CLASSES, "mean")]

@@ -112,12 +112,3 @@ def test_a_report_gives_two_tables(tmp_path: pathlib.Path) -> None:
     none = "0 % 0 % 0 % 0 %"  # 0.5 m wide
     assert f"Pedestrian 0-20 m 1 1 0.80 0.30 {none}" in lines
     assert "Pedestrian 20-40 m 1 1 0.00 2.50 0 % 0 % 100 % 0 %" in lines
-
-
-def test_a_folder_without_an_evaluation_is_an_error(tmp_path: pathlib.Path) -> None:
-    result = CliRunner().invoke(center_distance.main, [str(tmp_path)])
-    assert result.exit_code == 2
-    assert "predictions.npz is missing" in result.output
-    result = CliRunner().invoke(center_distance.main, [str(tmp_path), "--within", "0"])
-    assert result.exit_code == 2
-    assert "--within" in result.output

@@ -99,9 +99,6 @@ class TestFit:
         steps = cfar.fit_rcs_steps(names, [1.0, 2.0, 3.0, 0.0, 5.0, -9.0])
         assert steps[1][1] <= steps[0][1] - 1.0
 
-    def test_no_objects_no_steps(self):
-        assert cfar.fit_rcs_steps([], []) == ()
-
 
 def test_apparent_cross_section_of_a_point_is_its_own():
     projection = projection_of((20.4, 0.0, 8.0))

@@ -38,26 +38,11 @@ def test_boxes_are_moved_along_and_across_the_line_of_sight() -> None:
     np.testing.assert_allclose(echo_accuracy.overlap(boxes, none, half), 1 / 3)
 
 
-def test_scenes_without_pedestrians_are_an_error() -> None:
-    result = CliRunner().invoke(echo_accuracy.main, ["--scenes", "1"])
-    assert result.exit_code == 2
-    assert "1 scenes have no Pedestrian" in result.output
-    assert "increase --scenes" in result.output
-
-
-def test_two_sensors_at_once_are_an_error() -> None:
-    arguments = ["--full-size", "--range-bins", "100"]
-    result = CliRunner().invoke(echo_accuracy.main, arguments)
-    assert result.exit_code == 2
-    assert "--full-size has 256 range bins" in result.output
-
-
-@pytest.mark.parametrize("cls", ["Pedestrian", "Bicycle"])
-def test_scenes_are_measured(cls: str) -> None:
-    arguments = ["--scenes", "16", "--range-bins", "32", "--cls", cls]
+def test_scenes_are_measured() -> None:
+    arguments = ["--scenes", "16", "--range-bins", "32", "--cls", "Bicycle"]
     result = CliRunner().invoke(echo_accuracy.main, arguments)
     assert result.exit_code == 0, result.output
-    assert f"echo position of class {cls}, 32 range bins" in result.output
+    assert "echo position of class Bicycle, 32 range bins" in result.output
     rows = [line.split() for line in result.output.splitlines() if " %" in line]
     assert [row[0] for row in rows] == ["5-20", "20-40"]
     for row in rows:

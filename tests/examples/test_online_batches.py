@@ -8,16 +8,9 @@ from online_batches import OnlineBatches
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.simulator import SequenceSimulator
 
+GRID = {"num_doppler": 8, "num_range": 32, "num_elevation": 5, "num_azimuth": 24}
 OPTIONS = SimulationOptions(
-    train_sequences=3,
-    frames_per_sequence=4,
-    grid={
-        "num_doppler": 8,
-        "num_range": 32,
-        "num_elevation": 5,
-        "num_azimuth": 24,
-        "max_range_m": 62.0,
-    },
+    train_sequences=3, frames_per_sequence=4, image_width=0, grid=GRID
 )
 
 
@@ -61,9 +54,7 @@ def test_frame_differs_from_the_simulator_by_noise_only(source):
     batch = source.batch(5)
     index = int(batch.frame[0])
     number, spec = source._specs[index]
-    simulator = SequenceSimulator(
-        source._source.make(number), source.grid, source._parameters, 0
-    )
+    simulator = SequenceSimulator(source._source.make(number), source._options)
     expected = simulator.run(
         simulator.radar_input(simulator.sequence.frame(spec.scene_idx))
     )

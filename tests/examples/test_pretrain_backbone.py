@@ -101,10 +101,3 @@ def test_it_learns_and_what_it_writes_is_a_frozen_backbone(
     assert jax.tree.map(np.shape, params["image_backbone"]) == jax.tree.map(
         lambda leaf: leaf.shape, shapes["params"]
     )
-
-
-def test_a_model_without_camera_is_rejected(tmp_path: pathlib.Path) -> None:
-    command = ["--config", "quickstart", "--out", str(tmp_path / "x")]
-    result = CliRunner().invoke(pretraining.main, command)
-    assert result.exit_code != 0
-    assert "no simulated images, or its model no camera" in result.output

@@ -1,29 +1,30 @@
 """Conversions of the ROS 2 node, without ROS."""
 
 import numpy as np
-import pytest
 import ros2_node
 
+from radejax.core.structures import Detections
 from radejax.data.points import Points
-
-from .. import small_models as small
 
 
 def test_boxes_have_the_yaw_as_a_quaternion():
-    detector, projection = small.detector(), small.projections(1)
-    detections = detector(projection)
+    boxes = np.array([[[9.0, 1, 0.5, 4, 2, 1, 2.5], [20, -3, 0, 1, 1, 2, -0.4]]])
+    detections = Detections(
+        boxes=boxes,
+        scores=np.array([[0.9, 0.25]]),
+        classes=np.array([[0, 2]]),
+        is_valid=np.array([[True, True]]),
+        num_truncated=np.zeros(1, int),
+    )
     rows = list(ros2_node.box_fields(detections, 0.7))
-    assert len(rows) == int(detections.is_valid.sum()) > 0
-    for row, (position, quaternion, size, cls, score) in enumerate(rows):
-        box = np.asarray(detections.boxes[0, row])
-        raised = [*position[:2], position[2] - 0.7]
-        np.testing.assert_allclose([*raised, *size], box[:6], rtol=1e-6, atol=1e-6)
-        x, y, z, w = quaternion
-        assert (x, y) == (0.0, 0.0)
-        assert z * z + w * w == pytest.approx(1.0)
-        assert np.sin(2 * np.arctan2(z, w) - box[6]) == pytest.approx(0.0, abs=1e-6)
-        assert cls == detector.classes[int(detections.classes[0, row])]
-        assert score == pytest.approx(float(detections.scores[0, row]))
+    assert [row[3:] for row in rows] == [("Sedan", 0.9), ("Pedestrian", 0.25)]
+    for box, (position, quaternion, size, _, _) in zip(boxes[0], rows, strict=True):
+        np.testing.assert_allclose(
+            [*position, *size], np.add(box[:6], [0, 0, 0.7, 0, 0, 0])
+        )
+        np.testing.assert_allclose(
+            quaternion, [0, 0, np.sin(box[6] / 2), np.cos(box[6] / 2)]
+        )
 
 
 def test_points_are_float32_one_after_the_other():

@@ -1,4 +1,4 @@
-"""`radejax simulate --fit` on files, and the simulation of what it found."""
+"""Parameters that are estimated from simulated tensors, and `radejax simulate --fit`."""
 
 from __future__ import annotations
 
@@ -8,15 +8,128 @@ import pathlib
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from PIL import Image
 
 from radejax.cli.main import main
 from radejax.core.errors import DataError, UserError
 from radejax.data.kradar.tesseract import read_tesseract
 from radejax.data.kradar.write import write_tesseract
+from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
-from radejax.simulation.fitting import fit_files
+from radejax.simulation.fitting import fit_files, fit_radar
+from radejax.simulation.radar import sensor, tensor
+from radejax.simulation.radar.tensor import RadarParameters
+from radejax.simulation.simulator import SequenceSimulator, make_source
+
+from .radar.test_tensor import points
+
+GRID = RadarGrid.reduced(
+    num_doppler=16, num_range=64, num_elevation=9, num_azimuth=56, max_range_m=75.6
+)
+
+
+def recording(grid=GRID, seed=0, **changes):
+    """One echo of 45 dB in the noise of a sensor."""
+    values = {"range_profile": 1.0, "noise_db": 100.0, "array_pedestal": 0.5} | changes
+    parameters = RadarParameters(**values)
+    state = sensor.draw_state(grid, parameters, np.random.default_rng(seed))
+    amplitude = 10.0 ** (145.0 / 20.0)
+    target = points(grid.range_m[20], 0.2, 0.0, grid.doppler_mps[3], amplitude)
+    noise = sensor.receiver_noise(grid, parameters).astype(np.float32)
+    rows = tensor.simulate(
+        target, noise, tensor.frame_key(seed), state, grid=grid,
+        parameters=parameters, output="tesseract",
+    )  # fmt: skip
+    return np.asarray(rows).transpose(tensor.TESSERACT_OF_ROWS), parameters
+
+
+@settings(max_examples=5, deadline=None)
+@given(
+    seed=st.integers(0, 100),
+    noise_db=st.floats(40.0, 120.0),
+    leakage=st.floats(0.02, 0.08),
+    range_correlation=st.floats(0.05, 0.44),
+    beam_spread_db=st.sampled_from([0.0, 0.5]),
+    azimuth_elements=st.sampled_from([24.0, 40.0]),
+    elevation_elements=st.sampled_from([8.0, 12.0]),
+    doppler_pedestal=st.sampled_from([0.0, 0.2, 1.0]),
+    array_pedestal=st.sampled_from([0.2, 0.5]),
+)
+def test_the_parameters_of_a_simulated_recording_are_found(seed, noise_db, **changes):
+    power, wanted = recording(seed=seed, **changes)
+    power = power * 10.0 ** ((noise_db - 100.0) / 10.0)
+    found = fit_radar([power], GRID)
+    assert found["noise_db"] == pytest.approx(noise_db, abs=0.8)
+    for name, tolerance in (("range_correlation", 0.05), ("beam_spread_db", 0.3)):
+        assert found[name] == pytest.approx(getattr(wanted, name), abs=tolerance)
+    assert abs(10.0 * np.log10(found["leakage"] / wanted.leakage)) < 5.0
+    # A correlation of 0.01 instead of 0 is that of a pedestal of 0.8 instead of 1.
+    assert found["doppler_pedestal"] == pytest.approx(
+        wanted.doppler_pedestal, abs=0.35 if wanted.doppler_pedestal == 1.0 else 0.1
+    )
+    # More elements with a stronger taper have nearly the same beam.
+    for axis in ("azimuth", "elevation"):
+        noise = []
+        for sensor_fields in (found, wanted.to_dict()):
+            elements, taper = (
+                sensor_fields[f"{axis}_elements"],
+                sensor_fields["array_pedestal"],
+            )
+            basis = tensor.array_basis(getattr(GRID, f"{axis}_rad"), elements, taper)
+            noise.append(basis @ basis.T)
+        np.testing.assert_allclose(*noise, atol=0.12)
+    range_m, level_db = np.array(found["profile_db"]).T
+    profile = 10.0 * np.log10(sensor.receiver_noise(GRID, wanted).mean(1)) - 100.0
+    rows = np.abs(GRID.range_m[:, None] - range_m).argmin(0)
+    np.testing.assert_allclose(level_db[1:-1], profile[rows][1:-1], atol=2.5)
+    np.testing.assert_allclose(
+        level_db, profile[rows], atol=3.0
+    )  # steepest at the ends
+
+
+def test_several_recordings_give_ranges_and_medians():
+    pairs = [recording(seed=n, noise_db=99.0 + n, leakage=0.03) for n in range(3)]
+    found = fit_radar((power for power, _ in pairs), GRID)
+    low, high = found["noise_db"]
+    assert (low, high) == pytest.approx((99.0, 101.0), abs=0.8)
+    assert found["azimuth_elements"] == pytest.approx(48.0, abs=2.0)
+    assert len(found["leakage"]) == 2
+
+
+def test_what_was_found_is_simulated_again():
+    power, _ = recording(leakage=0.05, range_correlation=0.3, azimuth_elements=40.0)
+    found = fit_radar([power], GRID)
+    fields = json.loads(json.dumps(found))
+    config = SimulationOptions(radar=fields, frames_per_sequence=1)
+    assert config.make_grid() == GRID
+    parameters = config.make_parameters()
+    assert parameters.profile_db == tuple(map(tuple, found["profile_db"]))
+    hash(parameters)  # a static argument
+    sequence = make_source(config).make(1)
+    simulator = SequenceSimulator(sequence, config)
+    again = simulator.run(simulator.radar_input(sequence.frame(0)), "tesseract")
+    assert fit_radar([again], GRID)["noise_db"] == pytest.approx(100.0, abs=1.0)
+
+
+def test_recordings_without_noise_are_refused():
+    with pytest.raises(DataError, match="no recordings"):
+        fit_radar([], GRID)
+    power, _ = recording()
+    for wrong in (np.ones_like(power), 10.0 * np.log10(power), np.zeros_like(power)):
+        with pytest.raises(DataError, match="linear power"):
+            fit_radar([wrong], GRID)
+
+
+@pytest.mark.parametrize(
+    "profile", [[(1.0,)], [(2.0, 0.0), (1.0, 0.0)], 3.0, [(-1.0, 0.0)], [(1.0, "a")]]
+)
+def test_profiles_that_are_not_points_by_range_are_refused(profile):
+    with pytest.raises(UserError, match="profile_db"):
+        RadarParameters(profile_db=profile)
+
 
 SMALL = {"image_width": 0, "image_height": 0, "frames_per_sequence": 1}
 

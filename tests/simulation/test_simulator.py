@@ -5,24 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.config import SimulationOptions
-from radejax.simulation.radar.tensor import RadarParameters
 from radejax.simulation.simulator import SequenceSimulator, make_source
 from radejax.simulation.world.traffic import make_sequence
 
-GRID = RadarGrid.reduced(
-    num_doppler=16, num_range=64, num_elevation=9, num_azimuth=56, max_range_m=75.6
-)
-PARAMETERS = RadarParameters(azimuth_elements=40.0, elevation_elements=12.0)
+OPTIONS = SimulationOptions(label_distance_m=60.0).replace(radar={"preset": "ideal"})
 
 
-def simulator(weather="normal", environment="urban", seed=0, parameters=PARAMETERS):
-    scene = make_sequence(
-        1, environment=environment, time="day", weather=weather, num_frames=5,
-        rng=np.random.default_rng(seed),
-    )  # fmt: skip
-    return SequenceSimulator(scene, GRID, parameters, seed)
+def simulator(weather="normal", **radar):
+    rng = np.random.default_rng(0)
+    scene = make_sequence(1, ("urban", "day", weather), 5, rng)
+    return SequenceSimulator(scene, OPTIONS.replace(radar=radar))
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +34,7 @@ def test_visible_objects_stand_out_of_the_noise(urban):
         floor.append(np.median(peak))
         for box in frame.boxes[visible]:
             toward = box[:2] * (1.0 - box[3] / 2 / np.hypot(*box[:2]))
-            r, a = GRID.nearest_bin(*toward)
+            r, a = urban.grid.nearest_bin(*toward)
             near = peak[max(r - 2, 0) : r + 4, max(a - 2, 0) : a + 3]
             brightness.append(near.max())
     stands_out = np.array(brightness) > np.mean(floor) + 6.0 / 184.3
@@ -70,11 +63,11 @@ def test_hidden_weak_and_outside_objects_are_not_visible(urban):
     frame = urban.sequence.frame(0)
     given = urban.radar_input(frame)
     visible = urban.is_radar_visible(frame, given)
-    inside = GRID.in_field_of_view(frame.boxes[:, 0], frame.boxes[:, 1])
+    inside = urban.grid.in_field_of_view(frame.boxes[:, 0], frame.boxes[:, 1])
     assert visible.any()
     assert not visible[~inside].any()
     assert not visible[given.lit < 0.15].any()
-    deaf = simulator(parameters=RadarParameters(gain_db=100.0))
+    deaf = simulator(gain_db=100.0)
     assert not deaf.is_radar_visible(frame, deaf.radar_input(frame)).any()
 
 
@@ -82,7 +75,7 @@ def test_rain_weakens_targets(urban):
     frame = urban.sequence.frame(0)
     dry, wet = urban.radar_input(frame), simulator("rain").radar_input(frame)
     boxes = frame.boxes
-    inside = GRID.in_field_of_view(boxes[:, 0], boxes[:, 1])
+    inside = urban.grid.in_field_of_view(boxes[:, 0], boxes[:, 1])
     difference = (dry.snr_db - wet.snr_db)[inside]
     # The wet radome costs 2 dB; the wet road mirrors better and gives some of it back.
     assert (difference > 1.0).all()
@@ -92,7 +85,7 @@ def test_rain_weakens_targets(urban):
 
 def test_labels_are_in_the_lidar_frame(urban):
     frame = urban.sequence.frame(1)
-    labels = urban.labels(frame, urban.radar_input(frame), (-2.54, 0.3, 0.7), 60.0)
+    labels = urban.labels(frame, urban.radar_input(frame))
     by_id = {label.track_id: label for label in labels}
     distance = np.hypot(frame.boxes[:, 0], frame.boxes[:, 1])
     assert len(labels) == (distance < 60.0).sum()

@@ -13,6 +13,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.random import Generator
 from PIL import Image, ImageDraw
 
 
@@ -60,7 +61,7 @@ def cover_level(seed: int, sequence: int, frame: int, weather: str) -> str:
 
 
 def add_precipitation(
-    image: Image.Image, air: Air, light: float, rng: np.random.Generator
+    image: Image.Image, air: Air, light: float, rng: Generator
 ) -> Image.Image:
     """Draws streaks of rain or flakes of snow on an image."""
     width, height = image.size
@@ -82,11 +83,7 @@ def add_precipitation(
 
 
 def cover_lens(
-    image: Image.Image,
-    level: str,
-    is_snow: bool,
-    light: float,
-    rng: np.random.Generator,
+    image: Image.Image, level: str, is_snow: bool, light: float, rng: Generator
 ) -> Image.Image:
     """Adds drops, slush or snow on the lens to an image.
 
@@ -119,7 +116,7 @@ def _blurred(image: Image.Image, factor: float) -> Image.Image:
     return smaller.resize(image.size, Image.Resampling.BICUBIC)
 
 
-def _drop_mask(size, share: float, rng: np.random.Generator) -> Image.Image:
+def _drop_mask(size, share: float, rng: Generator) -> Image.Image:
     """Draws a mask of soft round patches that cover about a fraction of the image."""
     width, height = 160, 90
     mask = Image.new("L", (width, height), 0)

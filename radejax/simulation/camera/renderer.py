@@ -17,12 +17,18 @@ from PIL import Image, ImageDraw
 from radejax.core.structures import CLASSES
 from radejax.geometry.camera import CameraCalibration
 from radejax.simulation.camera import details, lens, shapes
+from radejax.simulation.config import SimulationOptions
 from radejax.simulation.world.scene import SceneFrame, Sequence, is_blocked, rotate
 
 # K-Radar's values for the pair (see the calibration files of the dataset).
-_INTRINSICS = (567.7208, 577.2137, 628.7208, 369.3069)
-_DISTORTION = (-0.028874, 0.000602, 0.003957, -0.005047, 0.0)
-_ANGLES = {"yaw_deg": 88.6, "pitch_deg": 0.6, "roll_deg": 89.6}
+_front_camera = functools.partial(
+    CameraCalibration.from_angles,
+    intrinsics=(567.7208, 577.2137, 628.7208, 369.3069),
+    distortion=(-0.028874, 0.000602, 0.003957, -0.005047, 0.0),
+    yaw_deg=88.6,
+    pitch_deg=0.6,
+    roll_deg=89.6,
+)
 _TRANSLATIONS = ((0.18, -0.13, 0.0), (0.06, -0.13, 0.0))
 
 _SKY = {"day": np.array([168, 196, 226.0]), "night": np.array([14, 16, 26.0])}
@@ -45,26 +51,17 @@ _CLASS_COLORS = np.array(  # of silhouettes, in the order of `CLASSES`
 _HALF_BRIGHT_M = 20.0
 
 
-def stereo_calibration(
-    radar_from_lidar_m: tuple[float, float, float], width: int = 1280, height: int = 720
-) -> tuple[CameraCalibration, ...]:
-    """Returns the left and right front camera of K-Radar, scaled to an image size.
-
-    Args:
-        radar_from_lidar_m: Translation in meters from LiDAR to radar positions.
-        width: Width in pixels of each of the two images.
-        height: Height in pixels of the images.
-    """
-    return tuple(
-        CameraCalibration.from_angles(
-            intrinsics=_INTRINSICS,
-            distortion=_DISTORTION,
-            translation_m=translation,
-            radar_from_lidar_m=np.array(radar_from_lidar_m),
-            **_ANGLES,
-        ).resized(width, height)
-        for translation in _TRANSLATIONS
+def stereo_calibration(options: SimulationOptions) -> list[CameraCalibration]:
+    """Returns the left and right front camera of K-Radar, scaled to an image size."""
+    shift = options.radar_from_lidar_m
+    pair = (
+        _front_camera(translation_m=t, radar_from_lidar_m=shift) for t in _TRANSLATIONS
     )
+    return [c.resized(options.image_width, options.image_height) for c in pair]
+
+
+Values = Float[np.ndarray, "*all"]
+Pixels = Float[np.ndarray, "*points 2"]
 
 
 class Ground(NamedTuple):
@@ -89,9 +86,8 @@ class Ground(NamedTuple):
 def trace_ground(calibration: CameraCalibration, ground_m: float) -> Ground:
     """Intersects the ray of every pixel with the plane `z = ground_m` (radar frame)."""
     fx, fy, cx, cy = calibration.intrinsics
-    u, v = np.meshgrid(
-        np.arange(calibration.width) + 0.5, np.arange(calibration.height) + 0.5
-    )
+    columns, rows = np.arange(calibration.width), np.arange(calibration.height)
+    u, v = np.meshgrid(columns + 0.5, rows + 0.5)
     seen = np.stack([(u - cx) / fx, (v - cy) / fy], -1)
     ideal = undistort(seen, calibration.distortion)
     rays = np.concatenate([ideal, np.ones_like(u)[..., None]], -1)
@@ -110,9 +106,7 @@ def trace_ground(calibration: CameraCalibration, ground_m: float) -> Ground:
     )
 
 
-def undistort(
-    seen: Float[np.ndarray, "*points 2"], distortion: Float[np.ndarray, "5"]
-) -> Float[np.ndarray, "*points 2"]:
+def undistort(seen: Pixels, distortion: Float[np.ndarray, "5"]) -> Pixels:
     """Removes lens distortion from normalized coordinates by fixed-point iteration."""
     k1, k2, p1, p2, k3 = distortion
     ideal = seen.copy()
@@ -131,26 +125,15 @@ class CameraRenderer:
 
     Args:
         sequence: Scene, whose conditions determine light, colors and weather.
-        calibrations: Left and right camera.
-        seed: Seed of object colors, precipitation and lens cover.
-        cover_lens: Whether bad weather covers the lens in some frames.
-        mode: "scene", or "oracle" for only silhouettes of the objects (see `silhouettes`).
+        options: Options of the dataset. Their seed determines object colors, precipitation
+            and lens cover.
     """
 
-    def __init__(
-        self,
-        sequence: Sequence,
-        calibrations: tuple[CameraCalibration, ...],
-        seed: int,
-        *,
-        cover_lens: bool = True,
-        mode: str = "scene",
-    ) -> None:
-        self.sequence = sequence
-        self.calibrations = calibrations
-        self.cover_lens, self.seed, self.mode = cover_lens, seed, mode
+    def __init__(self, sequence: Sequence, options: SimulationOptions) -> None:
+        self.sequence, self.options = sequence, options
+        self.calibrations = calibrations = stereo_calibration(options)
         self.grounds = [trace_ground(c, sequence.ground_m) for c in calibrations]
-        rng = np.random.default_rng([seed, sequence.name, 7])
+        rng = np.random.default_rng([options.seed, sequence.name, 7])
         self.colors = shapes.object_colors(sequence.tracks.cls, rng)
         self.air = lens.AIR[sequence.weather]
         clear = sequence.weather == "normal"
@@ -169,7 +152,7 @@ class CameraRenderer:
 
     def view(self, frame: SceneFrame, side: int) -> UInt8[np.ndarray, "H W 3"]:
         """Renders the image of the left (0) or right (1) camera."""
-        if self.mode == "oracle":
+        if self.options.camera_mode == "oracle":
             return self.silhouettes(frame, side)
         calibration = self.calibrations[side]
         canvas = Image.fromarray(self._background(frame, self.grounds[side]))
@@ -178,15 +161,15 @@ class CameraRenderer:
             draw.polygon(polygon.points, fill=polygon.color)
         if self.light.headlights:
             self._lamps(frame, calibration, draw)
-        name, index, air = self.sequence.name, frame.index, self.air
+        seed, name, index = self.options.seed, self.sequence.name, frame.index
         brightness = 0.45 if self.light.headlights else 1.0
-        rng = np.random.default_rng([self.seed, name, side, index, 5])
-        canvas = lens.add_precipitation(canvas, air, brightness, rng)
-        if self.cover_lens:
+        rng = np.random.default_rng([seed, name, side, index, 5])
+        canvas = lens.add_precipitation(canvas, self.air, brightness, rng)
+        if self.options.cover_lens:
             weather, block = self.sequence.weather, index // lens.BLOCK_FRAMES
-            level = lens.cover_level(self.seed, name, index, weather)
-            rng = np.random.default_rng([self.seed, name, side, block, 6])
-            canvas = lens.cover_lens(canvas, level, air.is_snow, brightness, rng)
+            level = lens.cover_level(seed, name, index, weather)
+            rng = np.random.default_rng([seed, name, side, block, 6])
+            canvas = lens.cover_lens(canvas, level, self.air.is_snow, brightness, rng)
         return np.asarray(canvas)
 
     def silhouettes(self, frame: SceneFrame, side: int) -> UInt8[np.ndarray, "H W 3"]:
@@ -221,12 +204,11 @@ class CameraRenderer:
     def polygons(self, frame: SceneFrame, side: int) -> list[shapes.Polygon]:
         """Returns the polygons of objects and roadside in one camera, far ones first."""
         calibration = self.calibrations[side]
-        origin, white = shapes.camera_position(calibration), self.air.white
-        roadside = details.make_panels(frame, origin, self.sequence.ground_m, white)
-        classes, colors = [CLASSES[c] for c in frame.cls], self.colors[frame.track]
-        return shapes.visible_polygons(
-            frame.boxes, classes, colors, calibration, self.light, roadside
-        )
+        origin = shapes.camera_position(calibration)
+        ground_m = self.sequence.ground_m
+        roadside = details.make_panels(frame, origin, ground_m, self.air.white)
+        colors = self.colors[frame.track]
+        return shapes.visible_polygons(frame, colors, calibration, self.light, roadside)
 
     def _lamps(self, frame, calibration, draw) -> None:
         """Draws the visible headlights and rear lights of vehicles at night."""
@@ -269,29 +251,26 @@ class CameraRenderer:
         along = x + sequence.ego_along_m[frame.index]
         grain = _hash_noise(np.floor(along * 3.0), np.floor(left * 3.0)) - 0.5
         color = np.broadcast_to(verge, (x.size, 3)) + 24.0 * grain[:, None]
-        if lanes:
-            on_road = (left > min(lanes) - 0.4) & (left < max(lanes) + 0.4)
-            # Tire tracks have less snow.
-            tracks = 0.5 + 0.5 * np.cos(left * 2.0 * np.pi / 1.7)
-            snow = (self.air.white * (0.35 + 0.65 * tracks))[:, None]
-            asphalt = _ASPHALT * (1.0 - 0.3 * self.air.wetness)
-            asphalt = asphalt + 14.0 * grain[:, None]
-            surface = asphalt + snow * (_SNOW - asphalt)
-            color = np.where(on_road[:, None], surface, color)
-            dashed = np.mod(along, 12.0) < 5.0
-            width = 0.09 + depth * 0.0012  # at least a pixel far away
-            on_line = np.zeros(x.size, bool)
-            for border in lanes:
-                is_edge = border in (min(lanes), max(lanes))
-                on_line |= (np.abs(left - border) < width) & (dashed | is_edge)
-            paint = _MARKING * (1.0 - 0.5 * self.air.white)
-            color = np.where(on_line[:, None], paint + self.air.white * 100.0, color)
+        on_road = (left > min(lanes) - 0.4) & (left < max(lanes) + 0.4)
+        # Tire tracks have less snow.
+        tracks = 0.5 + 0.5 * np.cos(left * 2.0 * np.pi / 1.7)
+        snow = (self.air.white * (0.35 + 0.65 * tracks))[:, None]
+        asphalt = _ASPHALT * (1.0 - 0.3 * self.air.wetness)
+        asphalt = asphalt + 14.0 * grain[:, None]
+        surface = asphalt + snow * (_SNOW - asphalt)
+        color = np.where(on_road[:, None], surface, color)
+        dashed = np.mod(along, 12.0) < 5.0
+        width = 0.09 + depth * 0.0012  # at least a pixel far away
+        on_line = np.zeros(x.size, bool)
+        for border in lanes:
+            is_edge = border in (min(lanes), max(lanes))
+            on_line |= (np.abs(left - border) < width) & (dashed | is_edge)
+        paint = _MARKING * (1.0 - 0.5 * self.air.white)
+        color = np.where(on_line[:, None], paint + self.air.white * 100.0, color)
         return self.light.apply(color, x, y, depth)
 
 
-def _hash_noise(
-    i: Float[np.ndarray, "*all"], j: Float[np.ndarray, "*all"]
-) -> Float[np.ndarray, "*all"]:
+def _hash_noise(i: Values, j: Values) -> Values:
     """Computes uniform numbers in [0, 1) as a hash of two integers."""
     bits = i.astype(np.int64) * 374761393 + j.astype(np.int64) * 668265263
     bits &= 0xFFFFFFFF

@@ -7,9 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from radejax.core.structures import CLASSES
 from radejax.geometry.camera import CameraCalibration, project
 from radejax.simulation.camera import details
 from radejax.simulation.camera.details import Faces, Quads
+from radejax.simulation.world.scene import SceneFrame
 
 # A block in units of the half extents: x, y and z range, color role, and the taper, which is
 # the fraction of length and width at its top.
@@ -145,8 +147,7 @@ class Light(NamedTuple):
 
 
 def visible_polygons(
-    boxes: Float[np.ndarray, "N 7"],
-    classes: list[str],
+    frame: SceneFrame,
     colors: Float[np.ndarray, "N 2 3"],
     calibration: CameraCalibration,
     light: Light,
@@ -155,27 +156,22 @@ def visible_polygons(
     """Returns the faces that are turned toward the camera as polygons, far objects first.
 
     Args:
-        boxes: Boxes in the radar frame.
-        classes: Class name of each box.
+        frame: Scene of the frame.
         colors: Colors as returned by `object_colors`.
         calibration: Calibration of the camera.
         light: Brightness and haze.
         roadside: Faces of the surroundings, from `details.make_panels`.
     """
-    objects = _object_faces(boxes, classes, colors, camera_position(calibration))
+    objects = _object_faces(frame, colors, camera_position(calibration))
     faces = Faces(*map(np.concatenate, zip(objects, roadside, strict=True)))
     order = np.lexsort((-faces.block_depth_m, -faces.depth_m))
     faces = Faces(*(column[order] for column in faces))
     center = faces.corners.mean(1)
     color = light.apply(faces.color, center[:, 0], center[:, 1], faces.depth_m)
-    rows = zip(
-        _project_faces(faces.corners, calibration),
-        np.clip(color, 0, 255).astype(int).tolist(),
-        faces.depth_m.tolist(),
-        faces.box.tolist(),
-        strict=True,
-    )
-    return [Polygon(points, tuple(rgb), *rest) for points, rgb, *rest in rows if points]
+    points = _project_faces(faces.corners, calibration)
+    colors = np.clip(color, 0, 255).astype(int).tolist()
+    columns = points, map(tuple, colors), faces.depth_m.tolist(), faces.box.tolist()
+    return [Polygon(*row) for row in zip(*columns, strict=True) if row[0]]
 
 
 def camera_position(calibration: CameraCalibration) -> Float[np.ndarray, "3"]:
@@ -184,15 +180,16 @@ def camera_position(calibration: CameraCalibration) -> Float[np.ndarray, "3"]:
     return calibration.radar_from_lidar_m - to_ego @ calibration.translation_m
 
 
-def _object_faces(boxes, classes, colors, origin) -> Faces:
+def _object_faces(frame: SceneFrame, colors, origin) -> Faces:
     """Returns the faces of the objects that are turned toward the camera.
 
     Objects with their center more than 3 m behind the radar are left out.
     """
     flat, vector = np.zeros(0), np.zeros((0, 3))
     parts = [(np.zeros((0, 4, 3)), vector, flat, flat, flat.astype(int), vector)]
-    for index in np.flatnonzero(boxes[:, 0] > -3.0):
-        box, cls = boxes[index], classes[index]
+    for index in np.flatnonzero(frame.boxes[:, 0] > -3.0):
+        box = frame.boxes[index]
+        cls = CLASSES[frame.cls[index]]
         cos, sin = np.cos(box[6]), np.sin(box[6])
         turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]])
         corners = _BLOCK_CORNERS[cls] * box[3:6] / 2.0 @ turn.T + box[:3]  # [K, 8, 3]

@@ -42,6 +42,7 @@ from radejax.simulation.radar import sensor
 from radejax.simulation.radar.tensor import RadarParameters
 
 Cells = Float[np.ndarray, "*cells"]
+Points = Float[np.ndarray, "S 3"]
 
 
 class Surface(NamedTuple):
@@ -125,12 +126,12 @@ def noise_profile(
     volume = distance**2 * beam * grid.range_widths_m
     area = distance * width * grid.range_widths_m
     level_db = parameters.gain_db + parameters.receiver_db
-    way = attenuation(weather, distance)
-    way = way * sensor.high_pass(distance, parameters.high_pass_m)
-    gain = 10.0 ** ((level_db + law.backscatter_db) / 10.0)
-    rain = gain * (volume / distance**4 * way)
-    gain = 10.0 ** (level_db / 10.0) * parameters.ground_clutter
-    ground = gain * (area / distance**4 * way)
+    high_pass = sensor.high_pass(distance, parameters.high_pass_m)
+    way = attenuation(weather, distance) * high_pass
+    of_drops = 10.0 ** ((level_db + law.backscatter_db) / 10.0)
+    rain = of_drops * (volume / distance**4 * way)
+    of_stones = 10.0 ** (level_db / 10.0) * parameters.ground_clutter
+    ground = of_stones * (area / distance**4 * way)
     speed = ego_velocity_mps[:1]
     of_rain = _doppler_share(-speed, law.spread_mps, grid)
     of_ground = _doppler_share(-speed * np.cos(grid.azimuth_rad), None, grid)
@@ -181,10 +182,7 @@ def reflection(
 
 
 def bounce(
-    position_m: Float[np.ndarray, "S 3"],
-    ground_m: float,
-    surface: Surface,
-    wavelength_m: float,
+    position_m: Points, ground_m: float, surface: Surface, wavelength_m: float
 ) -> Complex[np.ndarray, " S"]:
     """Computes the two-way factor on the amplitude of targets above a flat road.
 

@@ -74,6 +74,9 @@ OCCLUDED_DB = -22.0
 """Two-way gain in dB behind another object. Our choice: some power is diffracted around it or
 reflected under it."""
 
+_SIDES = np.array([(1.0, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0)])
+"""Normals of the front, rear, left and right face."""
+
 _GLINT_WIDTH_RAD = np.deg2rad(6.0)
 _BACK_LEAK = 0.02
 """Relative power of a scatterer on a face that is turned away from the radar."""
@@ -137,20 +140,15 @@ def _one_object(
     area = np.array([width, width, length, length]) * height
     face = rng.choice(4, count, p=area / area.sum())
     face[:4] = np.arange(4)  # every side has at least one
-    sign = np.where(face % 2 == 0, 1.0, -1.0)
-    is_end = face < 2
+    normal = _SIDES[face]
     along = rng.uniform(-1.0, 1.0, count)
     # Half of the points are moved outward, as edges and corners scatter more.
     along = np.where(rng.random(count) < 0.5, np.sign(along) * abs(along) ** 0.3, along)
     # Most of the power comes from low parts: bumpers, wheels and their reflection in the
     # road.
     up = rng.beta(1.6, 2.4, count) * 2.0 - 1.0
-    position = np.stack(
-        [np.where(is_end, sign, along), np.where(is_end, along, sign), up], 1
-    )
-    normal = np.stack(
-        [np.where(is_end, sign, 0.0), np.where(is_end, 0.0, sign), np.zeros(count)], 1
-    )
+    position = np.where(normal == 0.0, along[:, None], normal)
+    position[:, 2] = up
     weight = rng.exponential(1.0, count)
     is_micro = rng.random(count) < law.micro
     micro = np.where(is_micro, rng.uniform(0.4, 1.0, count), 0.0)
@@ -223,12 +221,9 @@ def scatter_objects(
     used = np.flatnonzero(owner_of_track[centers.track] >= 0)
     owner = owner_of_track[centers.track[used]]
     box = boxes[owner]  # [S, 7]
-
-    def turn(v: Vectors) -> Vectors:
-        return np.stack([*scene.rotate(v[:, 0], v[:, 1], box[:, 6]), v[:, 2]], 1)
-
-    position = box[:, :3] + turn(centers.position[used] * box[:, 3:6] / 2.0)
-    normal = turn(centers.normal[used])
+    inside = centers.position[used] * box[:, 3:6] / 2.0
+    position = box[:, :3] + scene.turned(inside, box[:, 6])
+    normal = scene.turned(centers.normal[used], box[:, 6])
     distance = np.linalg.norm(position, axis=1)
     cosine = -(normal * position).sum(1) / np.maximum(distance, 1e-6)
     rcs = centers.power_m2[used] * face_gain(cosine, centers.glint[used])
@@ -293,19 +288,19 @@ def to_scatterers(
     distance = np.maximum(np.linalg.norm(position, axis=1), 1e-3)
     way = np.mod(4.0 * np.pi * distance / wavelength_m, 2 * np.pi)
     phase = found.phase_rad + way
-    columns = np.stack(
-        [
-            distance,
-            -np.arctan2(position[:, 1], position[:, 0]),
-            np.arcsin(np.clip(position[:, 2] / distance, -1.0, 1.0)),
-            (velocity * position[:, :2]).sum(1) / distance,
-            amplitude * np.cos(phase),
-            amplitude * np.sin(phase),
-        ]
-    )
     missing = -len(distance) % CAPACITY_STEP if len(distance) else CAPACITY_STEP
-    columns = np.pad(columns, ((0, 0), (0, missing))).astype(np.float32)
-    return Scatterers(columns[0], columns[1], columns[2], columns[3], columns[4:].T)
+
+    def padded(*columns: Values) -> Float[np.ndarray, "K P"]:
+        return np.pad(columns, ((0, 0), (0, missing))).astype(np.float32)
+
+    range_m, azimuth_rad, elevation_rad, velocity_mps = padded(
+        distance,
+        -np.arctan2(position[:, 1], position[:, 0]),
+        np.arcsin(np.clip(position[:, 2] / distance, -1.0, 1.0)),
+        (velocity * position[:, :2]).sum(1) / distance,
+    )
+    parts = padded(amplitude * np.cos(phase), amplitude * np.sin(phase))
+    return Scatterers(range_m, azimuth_rad, elevation_rad, velocity_mps, parts.T)
 
 
 def scatter_surroundings(
@@ -324,12 +319,15 @@ def scatter_surroundings(
     cosine = np.cos(toward - fixed.normal_rad)
     gain = np.where(np.isnan(fixed.normal_rad), 1.0, face_gain(np.abs(cosine), 4.0))
     power = received_power(position, 10.0 ** (fixed.rcs_dbsm / 10.0) * gain, parameters)
-    owner = np.full(len(position), -1)
-    blocked = scene.is_blocked(position, frame.boxes, owner)
-    power = np.where(blocked, power * 10.0 ** (OCCLUDED_DB / 10.0), power)
-    at_rest = np.zeros((len(position), 2))
-    phase_rad = phase_rad[frame.reflector_idx]
-    return FrameScattering(position, at_rest, power, phase_rad, owner)
+    no_owner = np.full(len(position), -1)
+    blocked = scene.is_blocked(position, frame.boxes, no_owner)
+    return FrameScattering(
+        position_m=position,
+        velocity_mps=np.zeros((len(position), 2)),
+        power=np.where(blocked, power * 10.0 ** (OCCLUDED_DB / 10.0), power),
+        phase_rad=phase_rad[frame.reflector_idx],
+        owner=no_owner,
+    )
 
 
 MIRROR_DB = -18.0

@@ -20,27 +20,20 @@ from jaxtyping import Float
 from scipy.special import ndtri
 
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.simulation.radar.tensor import (
-    RadarParameters,
-    SensorState,
-    element_pairs,
-)
+from radejax.simulation.radar import tensor
+from radejax.simulation.radar.tensor import RadarParameters, SensorState
 
-_NEAR_PROFILE = np.array(
-    [
-        (0.0, 45.0), (0.46, 12.0), (0.9, 6.0), (3.0, 6.0), (3.7, 3.5), (5.1, 0.0),
-        (6.5, -5.0), (9.3, -5.0), (12.0, -2.0), (16.0, -0.7), (30.0, 0.0),
-    ]
-)  # fmt: skip
+_NEAR_PROFILE = np.array([
+    (0.0, 45.0), (0.46, 12.0), (0.9, 6.0), (3.0, 6.0), (3.7, 3.5), (5.1, 0.0),
+    (6.5, -5.0), (9.3, -5.0), (12.0, -2.0), (16.0, -0.7), (30.0, 0.0),
+])  # fmt: skip
 """Distance in m, and noise in dB relative to that of medium ranges. The dip is 2 dB deeper than
 that of the map, in which near echoes leak into it."""
 
-_FAR_PROFILE = np.array(
-    [
-        (0.88, 0.0), (0.907, -1.0), (0.925, -2.7), (0.95, -6.2), (0.965, -3.9),
-        (0.978, 0.0), (0.996, 5.0), (1.0, 11.0),
-    ]
-)  # fmt: skip
+_FAR_PROFILE = np.array([
+    (0.88, 0.0), (0.907, -1.0), (0.925, -2.7), (0.95, -6.2), (0.965, -3.9),
+    (0.978, 0.0), (0.996, 5.0), (1.0, 11.0),
+])  # fmt: skip
 """Fraction of the maximum range, and noise as in `_NEAR_PROFILE`."""
 
 
@@ -133,7 +126,7 @@ def _phase_errors(
     They are the quantiles of a normal distribution in random order. Independent numbers
     would cancel the peak of the beam in some sequences.
     """
-    place, weight = element_pairs(elements, parameters.array_pedestal)
+    place, weight = tensor.element_pairs(elements, parameters.array_pedestal)
     total = np.where(place > 0, 2.0 * weight, np.sqrt(2.0) * weight).sum()
     effective = total**2 / (2.0 * weight**2).sum()
     spread_rad = np.sqrt(np.log1p(parameters.leakage * effective))

@@ -32,6 +32,10 @@ from radejax.geometry.radar_grid import RadarGrid
 
 PerTarget = Float[Array, " S"]
 Bits = UInt32[jax.Array, "*all"]
+White = Float[jax.Array, " count"]
+Key = UInt32[Array, "2"]
+Phases = Float[Array, " P"] | None
+Pedestal = float | Float[Array, ""]
 Output = Literal["tesseract", "projection"]
 
 TESSERACT_OF_ROWS = (2, 0, 1, 3)
@@ -41,12 +45,10 @@ TESSERACT_OF_ROWS = (2, 0, 1, 3)
 Level = Annotated[float, Ge(-1e3), Le(1e3)]
 Elements = Annotated[float, Ge(1), Le(512)]
 
-DRAWN = frozenset(
-    (
-        *("gain_db", "noise_db", "receiver_db", "range_profile", "high_pass_m"),
-        *("leakage", "range_correlation", "beam_spread_db", "ground_clutter"),
-    )
-)
+DRAWN = frozenset((
+    "gain_db", "noise_db", "receiver_db", "range_profile", "high_pass_m",
+    "leakage", "range_correlation", "beam_spread_db", "ground_clutter",
+))  # fmt: skip
 """Fields of `RadarParameters` that can differ between sequences."""
 
 
@@ -130,9 +132,7 @@ class RadarParameters(Options, section="config.simulation.radar"):
 
         They are drawn uniformly from their ranges.
         """
-        drawn: dict[str, Any] = {
-            name: rng.uniform(low, high) for name, low, high in self.ranges
-        }
+        drawn: dict[str, Any] = {n: rng.uniform(a, b) for n, a, b in self.ranges}
         if self.gain_doppler_bins:
             share = max(num_doppler, 1) / self.gain_doppler_bins
             drawn["gain_db"] = drawn.get("gain_db", self.gain_db) + 10 * np.log10(share)
@@ -184,9 +184,7 @@ class Scatterers(struct.PyTreeNode):
 
 
 def window_response(
-    x: Float[Array, "*bins"],
-    pedestal: float | Float[Array, ""],
-    num_samples: float = 0.0,
+    x: Float[Array, "*bins"], pedestal: Pedestal, num_samples: float = 0.0
 ) -> Float[jax.Array, "*bins"]:
     """Computes the zero-phase transform of a raised cosine on a pedestal, 1 at its peak.
 
@@ -239,7 +237,7 @@ def range_response(
     range_m: PerTarget,
     grid: RadarGrid,
     parameters: RadarParameters,
-    pedestal: float | Float[Array, ""] = 0.0,
+    pedestal: Pedestal = 0.0,
 ) -> Float[jax.Array, "R S"]:
     """Computes amplitudes on the range axis."""
     resolution = parameters.range_resolution_m or grid.range_widths_m
@@ -252,7 +250,7 @@ def range_response(
 def simulate(
     scatterers: Scatterers,
     noise_power: Float[Array, "R D"],
-    key: UInt32[Array, "2"],
+    key: Key,
     state: SensorState | None = None,
     *,
     grid: RadarGrid,
@@ -283,15 +281,17 @@ def simulate(
     m, n = parameters.elevation_elements, parameters.azimuth_elements
     elevation_basis = array_basis(elevation_rad, m, pedestal)
     azimuth_basis = array_basis(grid.azimuth_rad, n, pedestal)
-    up = None if state is None else state.elevation_phase_rad
-    across = None if state is None else state.azimuth_phase_rad
+    up: Phases = None
+    across: Phases = None
+    of_range: Pedestal = 0.0
+    if state is not None:
+        up, across = state.elevation_phase_rad, state.azimuth_phase_rad
+        azimuth_basis = azimuth_basis * state.beam_gain[:, None]
+        of_range = state.range_pedestal
     elevation = array_signal(scatterers.elevation_rad, m, pedestal, up)  # [M, S]
     azimuth = array_signal(scatterers.azimuth_rad, n, pedestal, across)  # [N, S]
-    if state is not None:
-        azimuth_basis = azimuth_basis * state.beam_gain[:, None]
     window = parameters.doppler_pedestal
     doppler = doppler_response(scatterers.velocity_mps, grid, window)  # [D, S]
-    of_range = 0.0 if state is None else state.range_pedestal
     in_range = range_response(scatterers.range_m, grid, parameters, of_range)  # [R, S]
     magnitude = jnp.linalg.norm(scatterers.amplitude, axis=-1)
     num_kept = min(parameters.max_scatterers_per_row, magnitude.shape[0])
@@ -338,17 +338,13 @@ def array_basis(
     """
     place, weight = element_pairs(elements, pedestal)
     turn = np.pi * np.sin(axis_rad)[:, None] * place
-    basis = np.concatenate(
-        [weight * np.cos(turn), (weight * np.sin(turn))[:, place > 0]], axis=1
-    )
+    sine = (weight * np.sin(turn))[:, place > 0]
+    basis = np.concatenate([weight * np.cos(turn), sine], axis=1)
     return (basis / np.linalg.norm(basis, axis=1, keepdims=True)).astype(np.float32)
 
 
 def array_signal(
-    angle_rad: PerTarget,
-    elements: float,
-    pedestal: float,
-    phase_rad: Float[Array, " P"] | None = None,
+    angle_rad: PerTarget, elements: float, pedestal: float, phase_rad: Phases = None
 ) -> Float[jax.Array, "N S"]:
     """Returns the signals of point targets at the inputs of `array_basis`.
 
@@ -404,7 +400,7 @@ _product = functools.partial(jnp.dot, precision=lax.Precision.HIGHEST)
 
 
 def _noise(
-    power: Float[jax.Array, " D"], white: Float[jax.Array, " count"], pedestal: float
+    power: Float[jax.Array, " D"], white: White, pedestal: float
 ) -> Float[jax.Array, "D columns"]:
     """Computes the complex Gaussian noise of one range row at the inputs of the arrays.
 
@@ -423,11 +419,8 @@ def _noise(
 
 
 def _correlate(
-    white: Float[jax.Array, " count"],
-    side: Float[Array, ""],
-    key: UInt32[Array, "2"],
-    row_idx: UInt32[jax.Array, ""],
-) -> Float[jax.Array, " count"]:
+    white: White, side: Float[Array, ""], key: Key, row_idx: UInt32[jax.Array, ""]
+) -> White:
     """Filters the white noise of a range row by the window of the range axis.
 
     The noise of the rows before and after it is generated again.
@@ -438,9 +431,7 @@ def _correlate(
     return (white + side * (before + after)) * lax.rsqrt(1.0 + 2.0 * side**2)
 
 
-def _white_noise(
-    count: int, key: UInt32[Array, "2"], row_idx: UInt32[jax.Array, ""]
-) -> Float[jax.Array, " {count}"]:
+def _white_noise(count: int, key: Key, row_idx: UInt32[jax.Array, ""]) -> White:
     """Generates independent Gaussian numbers with a mean square of 1/2.
 
     Adjacent numbers are the real and imaginary part of one complex number. It is computed

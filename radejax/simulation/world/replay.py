@@ -18,15 +18,14 @@ from radejax.data.kradar import Frame
 from radejax.simulation.world import environments, scene
 from radejax.simulation.world.scene import Road, Sequence, Tracks
 
+Shift = tuple[float, float, float]
+
 MAX_SPEED_MPS = 60.0
 """Relative speed above which motion is assumed to be a swap of track identities."""
 
 
 def make_real_sequence(
-    frames: list[Frame],
-    *,
-    radar_from_lidar_m: tuple[float, float, float],
-    rng: np.random.Generator,
+    frames: list[Frame], radar_from_lidar_m: Shift, rng: np.random.Generator
 ) -> Sequence:
     """Creates a scene from the labels of one sequence.
 
@@ -71,9 +70,7 @@ def make_real_sequence(
     )
 
 
-def collect_tracks(
-    frames: list[Frame], radar_from_lidar_m: tuple[float, float, float]
-) -> Tracks:
+def collect_tracks(frames: list[Frame], radar_from_lidar_m: Shift) -> Tracks:
     """Collects the labels of all frames as tracks with positions in the radar frame.
 
     Labels with the same track id and class form a track. A label without an id (-1), or
@@ -119,7 +116,8 @@ def relative_velocity(
     averaged.
     """
     flat = tracks.position_m[..., :2]
-    count, present = len(clock), tracks.is_present
+    count = len(clock)
+    present = tracks.is_present
     before = np.maximum(np.arange(count) - 1, 0)
     after = np.minimum(np.arange(count) + 1, count - 1)
     here = np.arange(count)[:, None]

@@ -20,6 +20,9 @@ from radejax.core.structures import CLASSES
 FRAME_PERIOD_S = 0.1
 """Time between two frames: K-Radar records 10 frames per second."""
 
+Conditions = tuple[str, str, str]
+"""Environment, time and weather."""
+
 PerFrame = Float[np.ndarray, " F"]
 Points = Float[np.ndarray, "N 3"]
 
@@ -162,28 +165,30 @@ class Sequence:
 
     def frame(self, index: int, max_distance_m: float = 150.0) -> SceneFrame:
         """Returns the objects and reflectors at frame `index` up to a maximum distance."""
-        pose, tracks, fixed = self.ego_pose[index], self.tracks, self.reflectors
-        centers = _to_ego(tracks.position_m[index], pose)
+        tracks = self.tracks
+        fixed = self.reflectors
+        x_m, y_m, heading = self.ego_pose[index]
+        origin = np.array([x_m, y_m, 0.0])
+        centers = turned(tracks.position_m[index] - origin, -heading)
         is_near = np.hypot(centers[:, 0], centers[:, 1]) < max_distance_m
         chosen = np.flatnonzero(tracks.is_present[index] & is_near)
-        yaw = wrap_angle(tracks.yaw_rad[index] - pose[2])
+        yaw = wrap_angle(tracks.yaw_rad[index] - heading)
         boxes = np.concatenate([centers, tracks.size_m[index], yaw[:, None]], 1)
-        points = _to_ego(fixed.position_m, pose)
+        points = turned(fixed.position_m - origin, -heading)
         distance = np.hypot(points[:, 0], points[:, 1])
         # The ego vehicle blocks the view to the rear, and nothing is within 2 m of the radar.
         is_near = (distance > 2.0) & (distance < max_distance_m)
         seen = np.flatnonzero((points[:, 0] > 0) & is_near)
-        velocity = tracks.velocity_mps[index, chosen]
         return SceneFrame(
             boxes=boxes[chosen],
-            velocity_mps=np.stack(rotate(velocity[:, 0], velocity[:, 1], -pose[2]), 1),
+            velocity_mps=turned(tracks.velocity_mps[index, chosen], -heading),
             cls=tracks.cls[chosen],
             track=chosen,
             ego_velocity_mps=np.array([self.ego_speed_mps[index], 0.0]),
             reflectors=Reflectors(
                 position_m=points[seen],
                 rcs_dbsm=fixed.rcs_dbsm[seen],
-                normal_rad=fixed.normal_rad[seen] - pose[2],
+                normal_rad=fixed.normal_rad[seen] - heading,
                 kind=fixed.kind[seen],
             ),
             reflector_idx=seen,
@@ -217,13 +222,8 @@ def is_blocked(
         boxes: Boxes that can block.
         owner: Index of the box that the point belongs to, which does not block it, or -1.
     """
-
-    def into_boxes(p: Float[np.ndarray, "S 3"]) -> Float[np.ndarray, "S N 3"]:
-        x, y, z = np.moveaxis(p[:, None] - boxes[None, :, :3], -1, 0)
-        return np.stack([*rotate(x, y, -boxes[:, 6]), z], -1)
-
-    start = into_boxes(np.zeros((1, 3)))
-    ray = into_boxes(targets) - start
+    start = turned(0.0 - boxes[None, :, :3], -boxes[:, 6])  # in the frames of the boxes
+    ray = turned(targets[:, None] - boxes[None, :, :3], -boxes[:, 6]) - start
     ray = np.where(np.abs(ray) < 1e-9, 1e-9, ray)
     half = boxes[:, 3:6] / 2.0
     near, far = (-half - start) / ray, (half - start) / ray
@@ -245,7 +245,9 @@ def rotate(x: Any, y: Any, angle_rad: Any) -> tuple[Any, Any]:
     return cos * x - sin * y, sin * x + cos * y
 
 
-def _to_ego(points: Points, pose: Float[np.ndarray, "3"]) -> Points:
-    """Transforms world points to the frame of the radar at `pose` (x, y, heading)."""
-    x, y, z = points.T
-    return np.stack([*rotate(x - pose[0], y - pose[1], -pose[2]), z], 1)
+def turned(
+    vectors: Float[np.ndarray, "*all D"], angle_rad: Any
+) -> Float[np.ndarray, "*all D"]:
+    """Rotates vectors of two or three components counter-clockwise about the z axis."""
+    x, y, *z = np.moveaxis(vectors, -1, 0)
+    return np.stack([*rotate(x, y, angle_rad), *z], -1)

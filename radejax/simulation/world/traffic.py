@@ -14,6 +14,8 @@ from jaxtyping import Float
 from radejax.simulation.world import environments, scene
 from radejax.simulation.world.scene import Road, Sequence, Tracks
 
+Size = Float[np.ndarray, "3"]
+
 # Mean and standard deviation of length, width and height in meters.
 SIZES = {
     "Sedan": ((4.6, 1.87, 1.55), (0.3, 0.07, 0.12)),
@@ -26,10 +28,7 @@ SIZES = {
 
 def make_sequence(
     name: int,
-    *,
-    environment: str,
-    time: str,
-    weather: str,
+    conditions: scene.Conditions,
     num_frames: int,
     rng: np.random.Generator,
     vru_density_scale: float = 1.0,
@@ -38,15 +37,14 @@ def make_sequence(
 
     Args:
         name: Number of the sequence.
-        environment: A key of `ENVIRONMENTS`.
-        time: "day" or "night".
-        weather: One of K-Radar's seven weather conditions.
+        conditions: A key of `ENVIRONMENTS`, "day" or "night", and one of K-Radar's seven
+            weather conditions.
         num_frames: Number of frames, at 10 frames per second.
         rng: Random generator.
         vru_density_scale: Factor on the environment's number of pedestrians, motorcycles
             and bicycles.
     """
-    law = environments.ENVIRONMENTS[environment].with_vulnerable(vru_density_scale)
+    law = environments.ENVIRONMENTS[conditions[0]].with_vulnerable(vru_density_scale)
     road = Road(float(rng.uniform(-1.0, 1.0) * law.max_curvature))
     clock = np.arange(num_frames) * scene.FRAME_PERIOD_S
     mean_speed = rng.uniform(*law.speed_mps)
@@ -59,10 +57,8 @@ def make_sequence(
         law, road, along[-1] + environments.SIGHT_M, edges, rng, environments.GROUND_M
     )
     return Sequence(
-        name=name,
-        environment=environment,
-        time=time,
-        weather=weather,
+        name,
+        *conditions,
         ego_along_m=along,
         ego_speed_mps=speed,
         tracks=traffic.tracks(),
@@ -120,19 +116,18 @@ class _Traffic:
         self._cyclists(right + 0.5)
         return right - pavement - 1.0, left + pavement + 1.0
 
-    def _add(
-        self, cls: str, size: Float[np.ndarray, "3"], along, left, speed, turn: float
-    ) -> None:
+    def _add(self, cls: str, size: Size, along, left, speed, turn: float) -> None:
         """Adds an object whose positions and speeds are one number or one per frame."""
         path = (np.broadcast_to(v, self.clock.shape) for v in (along, left, speed))
         self.paths.append((cls, size, *path, turn))
 
-    def _size(self, cls: str) -> Float[np.ndarray, "3"]:
+    def _size(self, cls: str) -> Size:
         mean, deviation = SIZES[cls]
         return mean + np.array(deviation) * self.rng.normal(size=3).clip(-2, 2)
 
     def _vehicle_class(self) -> str:
-        draw, law = self.rng.random(), self.law
+        law = self.law
+        draw = self.rng.random()
         if draw < law.trucks:
             return "Bus or Truck"
         return "Motorcycle" if draw < law.trucks + law.two_wheelers else "Sedan"

@@ -46,11 +46,8 @@ def test_vehicles_are_the_same_on_both_sides(name):
 
 
 def frame_of(environment, seed):
-    scene = make_sequence(
-        1, environment=environment, time="day", weather="normal", num_frames=2,
-        rng=np.random.default_rng(seed),
-    )  # fmt: skip
-    return scene.frame(0)
+    rng = np.random.default_rng(seed)
+    return make_sequence(1, (environment, "day", "normal"), 2, rng).frame(0)
 
 
 def test_rails_follow_the_road_and_trees_face_the_camera():

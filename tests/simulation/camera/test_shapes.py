@@ -1,5 +1,7 @@
 """Faces of drawn objects: inside their boxes, sorted, cut at the camera."""
 
+import types
+
 import numpy as np
 import pytest
 
@@ -7,8 +9,9 @@ from radejax.core.structures import CLASSES
 from radejax.simulation.camera import shapes
 from radejax.simulation.camera.details import DETAILS, Faces
 from radejax.simulation.camera.renderer import stereo_calibration
+from radejax.simulation.config import SimulationOptions
 
-CALIBRATION = stereo_calibration((-2.54, 0.3, 0.7), 320, 180)[0]
+CALIBRATION = stereo_calibration(SimulationOptions())[0]
 NO_ROADSIDE = Faces(*map(np.zeros, ((0, 4, 3), (0, 3), 0, 0)), np.zeros(0, int))
 DAY = shapes.Light(1.0, np.full(3, 128.0), 0.0, False)
 
@@ -24,9 +27,9 @@ def test_blocks_fill_the_box_and_stay_in_it(cls):
 
 def polygons(boxes, classes):
     colors = np.zeros((len(boxes), 2, 3)) + 100.0
-    return shapes.visible_polygons(
-        np.array(boxes, float), classes, colors, CALIBRATION, DAY, NO_ROADSIDE
-    )
+    cls = [CLASSES.index(name) for name in classes]
+    frame = types.SimpleNamespace(boxes=np.array(boxes, float), cls=cls)
+    return shapes.visible_polygons(frame, colors, CALIBRATION, DAY, NO_ROADSIDE)
 
 
 def test_far_objects_come_first_and_hidden_faces_are_omitted():

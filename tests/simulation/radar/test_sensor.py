@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -23,9 +25,7 @@ def simulators(count, **changes):
     config = SimulationOptions(train_sequences=count, test_sequences=0, **changes)
     source = make_source(config)
     for number in source.numbers:
-        yield SequenceSimulator(
-            source.make(number), config.make_grid(), config.make_parameters(), 0
-        )
+        yield SequenceSimulator(source.make(number), config)
 
 
 def state_of(seed=0, **changes):
@@ -51,30 +51,25 @@ class TestDraws:
             if name == "gain_db":  # 16 Doppler bins integrate a quarter of 64
                 values = [value + 10.0 * np.log10(4.0) for value in values]
             assert low <= min(values) < max(values) <= high
-        states = [
-            made.radar_input(made.sequence.frame(0)).state for made in (first, second)
-        ]
-        assert (states[0].azimuth_phase_rad != states[1].azimuth_phase_rad).all()
+        phases = [made._state.azimuth_phase_rad for made in (first, second)]
+        assert (phases[0] != phases[1]).all()
 
     def test_frames_of_one_sequence_share_them_and_programs_are_shared_by_all(self):
-        made = next(simulators(1))
-        again = next(simulators(1))
+        made, again = next(simulators(1)), next(simulators(1))
         assert made.drawn == again.drawn
-        states = [
-            m.radar_input(m.sequence.frame(i)).state
-            for i, m in enumerate((made, again))
-        ]
-        np.testing.assert_array_equal(
-            states[0].elevation_phase_rad, states[1].elevation_phase_rad
+        states = (
+            made._state,
+            made.radar_input(made.sequence.frame(1)).state,
+            again._state,
         )
+        phases = [state.elevation_phase_rad for state in states]
+        np.testing.assert_array_equal(phases, [phases[0]] * 3)
         assert len({m.parameters for m in simulators(3)}) == 1  # static arguments
 
     def test_an_ideal_sensor_has_no_state(self):
         config = SimulationOptions(radar={"preset": "ideal"})
         assert config.make_parameters() == RadarParameters()
-        assert (
-            sensor.draw_state(GRID, RadarParameters(), np.random.default_rng()) is None
-        )
+        assert state_of() is None
 
 
 class TestNoise:
@@ -102,13 +97,7 @@ class TestNoise:
         whole = self.profile_db(GRID, range_profile=1.0)
         half = self.profile_db(GRID, range_profile=0.5)
         np.testing.assert_allclose(half, whole / 2.0, atol=0.3)
-        near = RadarGrid.reduced(
-            num_doppler=4,
-            num_range=64,
-            num_elevation=2,
-            num_azimuth=8,
-            max_range_m=50.0,
-        )
+        near = dataclasses.replace(GRID, range_m=np.linspace(0.0, 50.0, 64))
         assert self.profile_db(near, range_profile=1.0)[-1] > 10.0
         assert (self.profile_db(GRID) == 0.0).all()
 
@@ -119,13 +108,11 @@ class TestNoise:
         assert power[0].max() > 1e4 * np.median(power[0])
 
     def test_gain_of_the_receiver_moves_noise_and_echoes(self):
-        level = [
-            propagation.noise_profile(
-                "rain", GRID, RadarParameters(receiver_db=gain), np.zeros(2)
-            )
-            for gain in (0.0, 10.0)
+        sensors = RadarParameters(), RadarParameters(receiver_db=10.0)
+        given = [
+            propagation.noise_profile("rain", GRID, s, np.zeros(2)) for s in sensors
         ]
-        np.testing.assert_allclose(level[1], 10.0 * level[0], rtol=1e-5)
+        np.testing.assert_allclose(given[1], 10.0 * given[0], rtol=1e-5)
 
     @pytest.mark.parametrize("wanted", [0.3, 0.44])
     def test_neighboring_range_bins_correlate_as_wanted(self, wanted):
@@ -183,12 +170,12 @@ class TestLeakage:
         basis = tensor.array_basis(np.arcsin(sines), 48.0, 0.2)
 
         def pattern(index):
-            angle = np.float32([np.arcsin(sines[index])])
+            angle, phases = (
+                np.float32([np.arcsin(sines[index])]),
+                state.azimuth_phase_rad,
+            )
             return (
-                basis
-                @ np.asarray(
-                    tensor.array_signal(angle, 48.0, 0.2, state.azimuth_phase_rad)
-                )[:, 0]
+                basis @ np.asarray(tensor.array_signal(angle, 48.0, 0.2, phases))[:, 0]
             )
 
         np.testing.assert_allclose(pattern(30)[:-10], pattern(40)[10:], atol=1e-4)

@@ -1,7 +1,5 @@
 """The radar against theory: windows, bins, R^-4, interference, aliasing, noise."""
 
-import dataclasses
-
 import jax
 import numpy as np
 import pytest
@@ -33,18 +31,9 @@ def points(range_m, azimuth=0.0, elevation=0.0, velocity=0.0, amplitude=1.0):
 
 
 def tesseract(scatterers, *, noise=QUIET, grid=GRID, seed=(1,), **kwargs):
-    kwargs = {"parameters": PARAMETERS, **kwargs}
-    return np.asarray(
-        tensor.simulate(
-            scatterers,
-            noise,
-            tensor.frame_key(*seed),
-            grid=grid,
-            output="tesseract",
-            **kwargs,
-        ),
-        np.float64,
-    ).transpose(tensor.TESSERACT_OF_ROWS)
+    kwargs = {"grid": grid, "parameters": PARAMETERS, "output": "tesseract"} | kwargs
+    rows = tensor.simulate(scatterers, noise, tensor.frame_key(*seed), **kwargs)
+    return np.asarray(rows, np.float64).transpose(tensor.TESSERACT_OF_ROWS)
 
 
 def hann_by_dft(offset, num=64):
@@ -90,15 +79,8 @@ class TestPointTarget:
     @pytest.mark.parametrize("cell", [(3, 10, 4, 11), (12, 20, 2, 5), (8, 5, 6, 18)])
     def test_peaks_in_its_own_bin(self, cell):
         d, r, e, a = cell
-        power = tesseract(
-            points(
-                GRID.range_m[r],
-                GRID.azimuth_rad[a],
-                GRID.elevation_rad[e],
-                GRID.doppler_mps[d],
-                3.0,
-            )
-        )
+        place = GRID.range_m[r], GRID.azimuth_rad[a], GRID.elevation_rad[e]
+        power = tesseract(points(*place, GRID.doppler_mps[d], 3.0))
         assert np.unravel_index(power.argmax(), power.shape) == cell
         assert power.max() == pytest.approx(9.0, rel=1e-5)
 
@@ -126,30 +108,6 @@ class TestPointTarget:
             expected = (10 if axis == 1 else 7) + shift
             assert estimate == pytest.approx(expected, abs=0.01)
 
-    def test_sub_bin_angles_by_a_finer_look(self):
-        fine = RadarGrid.reduced(
-            num_doppler=2, num_range=2, num_elevation=121, num_azimuth=201,
-            max_range_m=1.0, max_azimuth_deg=30.0, max_elevation_deg=18.0,
-        )  # fmt: skip
-        power = tesseract(
-            points(1.0, 0.2345, -0.0987, fine.doppler_mps[1]),
-            grid=fine,
-            noise=np.zeros((2, 2), np.float32),
-        )
-        _, _, e, a = np.unravel_index(power.argmax(), power.shape)
-        assert fine.azimuth_rad[a] == pytest.approx(0.2345, abs=0.003)
-        assert fine.elevation_rad[e] == pytest.approx(-0.0987, abs=0.003)
-
-    def test_beam_widens_away_from_boresight(self):
-        fine = np.linspace(-0.9, 0.9, 3601)
-
-        def width(angle):
-            basis = tensor.array_basis(fine, 40.0, 0.2)
-            beam = basis @ tensor.array_signal(np.float32([angle]), 40.0, 0.2)[:, 0]
-            return np.count_nonzero(np.square(beam) > 0.5)
-
-        assert width(0.7) / width(0.0) == pytest.approx(1.0 / np.cos(0.7), rel=0.02)
-
     @pytest.mark.parametrize("elements", [3.0, 12.0, 21.0, 48.0])
     @pytest.mark.parametrize("pedestal", [0.0, 0.2, 1.0])
     def test_beams_are_the_windows_transform(self, elements, pedestal):
@@ -167,11 +125,6 @@ class TestPhysics:
         where = np.array([[20.0, 2.0, -0.3], [40.0, 4.0, -0.6]])
         power = received_power(where, np.ones(2), PARAMETERS)
         assert 10 * np.log10(power[0] / power[1]) == pytest.approx(12.041, abs=1e-3)
-
-    def test_radar_cross_section_is_linear_in_power(self):
-        where = np.array([[30.0, 0.0, 0.0]] * 2)
-        power = received_power(where, np.array([1.0, 100.0]), PARAMETERS)
-        assert power[1] / power[0] == pytest.approx(100.0)
 
     @pytest.mark.parametrize(
         ("phase", "expected"), [(0.0, 4.0), (np.pi / 2, 2.0), (np.pi, 0.0)]
@@ -213,22 +166,10 @@ class TestPhysics:
         )  # fmt: skip
         sharp = PARAMETERS.replace(range_resolution_m=1.0)
         coarse_energy = tesseract(points(15.3)).sum() * GRID.range_step_m
-        fine_energy = (
-            tesseract(
-                points(15.3),
-                grid=fine,
-                noise=np.zeros((63, 16), np.float32),
-                parameters=sharp,
-            ).sum()
-            * fine.range_step_m
-        )
+        quiet = np.zeros((63, 16), np.float32)
+        power = tesseract(points(15.3), grid=fine, noise=quiet, parameters=sharp)
+        fine_energy = power.sum() * fine.range_step_m
         assert fine_energy == pytest.approx(coarse_energy, rel=1e-3)
-
-    def test_sidelobes_of_the_array_surround_a_strong_target(self):
-        power = tesseract(points(10.0, GRID.azimuth_rad[12], 0.0, GRID.doppler_mps[8]))
-        azimuth_cut = 10 * np.log10(power[8, 10, 4] + 1e-12)
-        far = np.abs(np.arange(24) - 12) > 5
-        assert -45.0 < azimuth_cut[far].max() < -18.0
 
 
 class TestNoise:
@@ -255,13 +196,8 @@ class TestNoise:
     def test_neighbors_correlate_as_windows_and_arrays_say(self):
         # Powers of complex Gaussian noise correlate by the square of the field's
         # correlation, here summed over samples and antennas in float64.
-        noise = np.mean(
-            [
-                self.correlations(tesseract(self.NONE, noise=self.POWER, seed=(seed,)))
-                for seed in range(6)
-            ],
-            axis=0,
-        )
+        frames = (tesseract(self.NONE, noise=self.POWER, seed=(n,)) for n in range(6))
+        noise = np.mean([self.correlations(power) for power in frames], axis=0)
 
         def field_correlation(count, pedestal, shift):
             n = np.arange(count) - (count - 1) / 2
@@ -271,14 +207,13 @@ class TestNoise:
 
         a, b = np.sin(GRID.azimuth_rad[11:13])
         c, d = np.sin(GRID.elevation_rad[4:6])
-        expected = np.square(
-            [
-                field_correlation(16, 0.0, 1.0),  # Hann: 2/3
-                field_correlation(16, 0.0, 2.0),  # 1/6
-                field_correlation(20, 0.2, (b - a) * 10),
-                field_correlation(12, 0.2, (d - c) * 6),
-            ]
+        fields = (
+            field_correlation(16, 0.0, 1.0),  # Hann: 2/3
+            field_correlation(16, 0.0, 2.0),  # 1/6
+            field_correlation(20, 0.2, (b - a) * 10),
+            field_correlation(12, 0.2, (d - c) * 6),
         )
+        expected = np.square(fields)
         np.testing.assert_allclose(expected[:2], [4 / 9, 1 / 36], atol=1e-12)
         np.testing.assert_allclose(noise, expected, atol=0.05)
 
@@ -324,10 +259,7 @@ class TestNoise:
 
 def direct_tesseract(scatterers, grid, parameters):
     """The tensor from first principles: sums over samples and antennas, float64."""
-    s = [np.asarray(v, np.float64) for v in jax.tree.leaves(scatterers)]
-    by_name = dict(
-        zip([f.name for f in dataclasses.fields(scatterers)], s, strict=True)
-    )
+    given = jax.tree.map(np.float64, scatterers)
 
     def transform(offset, num, pedestal):  # [bins, S] in bins of num samples
         n = np.arange(num) - (num - 1) / 2
@@ -340,16 +272,15 @@ def direct_tesseract(scatterers, grid, parameters):
         return transform(sines * num / 2, int(num), parameters.array_pedestal)
 
     step = grid.doppler_mps[1] - grid.doppler_mps[0]
-    wrapped = (grid.doppler_mps[:, None] - by_name["velocity_mps"]) / step
+    wrapped = (grid.doppler_mps[:, None] - given.velocity_mps) / step
     wrapped = (wrapped + 8) % 16 - 8
     doppler = transform(wrapped, 16, 0.0)
     many = 4096  # a long chirp: the crop of its spectrum that the axis shows
-    ranges = transform(
-        (grid.range_m[:, None] - by_name["range_m"]) / grid.range_step_m, many, 0.0
-    )
-    azimuth = angle(grid.azimuth_rad, by_name["azimuth_rad"], 20)
-    elevation = angle(grid.elevation_rad, by_name["elevation_rad"], 12)
-    amplitude = by_name["amplitude"] @ [1.0, 1j]
+    offset = (grid.range_m[:, None] - given.range_m) / grid.range_step_m
+    ranges = transform(offset, many, 0.0)
+    azimuth = angle(grid.azimuth_rad, given.azimuth_rad, 20)
+    elevation = angle(grid.elevation_rad, given.elevation_rad, 12)
+    amplitude = given.amplitude @ [1.0, 1j]
     field = np.einsum(
         "s,ds,rs,es,as->drea", amplitude, doppler, ranges, elevation, azimuth
     )
@@ -369,6 +300,8 @@ class TestOutputs:
             tesseract(scene), expected, atol=1e-4 * expected.max()
         )
 
+    NOISE = np.full((32, 16), 1e9, np.float32)
+
     def scene(self):
         rng = np.random.default_rng(0)
         return points(
@@ -378,24 +311,24 @@ class TestOutputs:
         )  # fmt: skip
 
     def test_projection_equals_the_projected_tesseract(self):
-        from radejax.data.projection import project_tensor
-
-        noise = np.full((32, 16), 1e9, np.float32)
-        power = tesseract(self.scene(), noise=noise)
+        power = tesseract(self.scene(), noise=self.NOISE)
         fused = tensor.simulate(
-            self.scene(), noise, tensor.frame_key(1), grid=GRID, parameters=PARAMETERS
+            self.scene(),
+            self.NOISE,
+            tensor.frame_key(1),
+            grid=GRID,
+            parameters=PARAMETERS,
         )
         np.testing.assert_allclose(
             fused, project_tensor(power.astype(np.float32)), rtol=0, atol=2e-6
         )
 
     def test_vmap_over_frames(self):
-        noise = np.full((32, 16), 1e9, np.float32)
         keys = np.stack([tensor.frame_key(i) for i in range(2)])
 
         def one(key):
             return tensor.simulate(
-                self.scene(), noise, key, grid=GRID, parameters=PARAMETERS
+                self.scene(), self.NOISE, key, grid=GRID, parameters=PARAMETERS
             )
 
         batch = jax.vmap(one)(keys)
@@ -403,9 +336,8 @@ class TestOutputs:
 
     def test_dropping_the_weakest_scatterers_changes_little(self):
         few = PARAMETERS.replace(max_scatterers_per_row=40)
-        noise = np.full((32, 16), 1e9, np.float32)
-        all_power = tesseract(self.scene(), noise=noise)
-        some_power = tesseract(self.scene(), noise=noise, parameters=few)
+        all_power = tesseract(self.scene(), noise=self.NOISE)
+        some_power = tesseract(self.scene(), noise=self.NOISE, parameters=few)
         error = np.abs(some_power - all_power).max() / all_power.max()
         assert 0 < error < 1e-3
 

@@ -65,15 +65,9 @@ class TestScene:
     def test_objects_have_the_labels_boxes(self, source):
         scene = source.make(3)
         frame = scene.frame(5)
-        boxes = {
-            (scene.tracks.label_cls[t], int(i)): b
-            for t, i, b in zip(
-                frame.track,
-                scene.tracks.track_id[frame.track],
-                frame.boxes,
-                strict=True,
-            )
-        }
+        cls, ids = scene.tracks.label_cls, scene.tracks.track_id
+        tracks = zip(frame.track, frame.boxes, strict=True)
+        boxes = {(cls[t], int(ids[t])): box for t, box in tracks}
         assert len(boxes) == 5
         for label in boxes_at(5):
             expected = np.array(label.box) + np.array([*OFFSET, 0, 0, 0, 0])
@@ -85,17 +79,17 @@ class TestScene:
         scene = source.make(3)
         frame = scene.frame(7)
         relative = frame.velocity_mps - frame.ego_velocity_mps
-        found = dict(
-            zip(
-                scene.tracks.track_id[frame.track].tolist(), relative[:, 0], strict=True
-            )
-        )
-        names = [scene.tracks.label_cls[t] for t in frame.track]
-        for name, velocity in zip(names, relative[:, 0], strict=True):
-            if name == "Bus or Truck":
-                assert velocity == pytest.approx(-18.0, abs=1e-4)
-        assert found[7] == pytest.approx(-10.0, abs=1e-4)
-        assert found[9] == pytest.approx(0.0, abs=1e-4)
+        cls, ids = scene.tracks.label_cls, scene.tracks.track_id
+        found = {
+            (cls[t], int(ids[t])): v[0]
+            for t, v in zip(frame.track, relative, strict=True)
+        }
+        for track, velocity in (
+            (("Bus or Truck", 8), -18.0),
+            (("Sedan", 7), -10.0),
+            (("Pedestrian Group", 9), 0.0),
+        ):
+            assert found[track] == pytest.approx(velocity, abs=1e-4)
 
     def test_ego_speed_is_that_at_which_parked_cars_stand(self, source):
         speed = source.make(3).ego_speed_mps
@@ -166,16 +160,11 @@ class TestWrittenTree:
         all_specs = LabelSource(whole).frames(3)
         assert specs == [s for s in all_specs if s.scene_idx in chosen]
 
-    def test_missing_labels(self, tmp_path):
+    def test_missing_labels_and_unknown_sequences_are_errors(self, labels_folder):
         with pytest.raises(FileNotFoundError, match="No such file"):
-            simulate_dataset(
-                make_config(tmp_path / "nowhere"), tmp_path / "out", progress=False
-            )
-
-    def test_unknown_sequence(self, labels_folder):
-        config = make_config(labels_folder, sequences=[4])
+            LabelSource(make_config(labels_folder / "nowhere"))
         with pytest.raises(UserError, match="sequence"):
-            LabelSource(config)
+            LabelSource(make_config(labels_folder, sequences=[4]))
 
 
 @pytest.mark.slow

@@ -19,9 +19,8 @@ def test_groups_count_as_their_single_class():
 
 def test_points_seen_from_a_turned_ego_by_hand():
     # At (10, 5), heading left: what is 3 m along +y in the world is 3 m ahead.
-    pose = np.array([10.0, 5.0, np.pi / 2])
     points = np.array([[10.0, 8.0, 0.5], [9.0, 5.0, 0.0]])
-    seen = scene._to_ego(points, pose)
+    seen = scene.turned(points - (10.0, 5.0, 0.0), -np.pi / 2)
     np.testing.assert_allclose(seen, [[3.0, 0.0, 0.5], [0.0, 1.0, 0.0]], atol=1e-12)
 
 

@@ -12,15 +12,8 @@ from radejax.simulation.world.traffic import make_sequence
 
 
 def sequence(environment="urban", seed=0, num_frames=20, **options):
-    return make_sequence(
-        1,
-        environment=environment,
-        time="day",
-        weather="normal",
-        num_frames=num_frames,
-        rng=np.random.default_rng(seed),
-        **options,
-    )
+    rng = np.random.default_rng(seed)
+    return make_sequence(1, (environment, "day", "normal"), num_frames, rng, **options)
 
 
 @pytest.mark.parametrize("environment", ENVIRONMENTS)
