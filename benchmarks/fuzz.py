@@ -28,8 +28,8 @@ def fuzz(name, seconds, start):
     """Runs a reader on corrupted files; returns counts of outcomes and the wrong outcomes."""
     total, all_wrong, end = collections.Counter(), [], time.time() + seconds
     while not total or time.time() < end:
-        counts, wrong = engine.counts(name, start, AT_ONCE)
-        for number, kind, text in wrong:
+        counts, wrong = engine.counts([(name, start, AT_ONCE)])[name]
+        for _, number, kind, text in wrong:
             print(f"{name} {number}: {kind}: {text}", file=sys.stderr)
         total, all_wrong, start = total + counts, all_wrong + wrong, start + AT_ONCE
     return total, all_wrong

@@ -7,7 +7,7 @@ import os
 import pathlib
 import tempfile
 import types
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from typing import Any
 
 import jax
@@ -209,6 +209,22 @@ def make() -> types.ModuleType:
     from radejax.config import load_module
 
     return load_module(GOLDEN / "dinorade_make.py")
+
+
+@pytest.fixture(scope="session")
+def released() -> Callable[[str], dict[str, np.ndarray]]:
+    """Function from a group of `tests/golden/released.npz` to its arrays."""
+    arrays = dict(np.load(GOLDEN / "released.npz"))
+
+    def group(name: str) -> dict[str, np.ndarray]:
+        prefix = f"{name}/"
+        found = {
+            k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)
+        }
+        assert found, name
+        return found
+
+    return group
 
 
 @pytest.fixture(scope="session")

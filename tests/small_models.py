@@ -14,6 +14,7 @@ from radejax.config import Config, load_config
 from radejax.geometry.camera import CameraCalibration, stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.saved import SavedModel
+from radejax.models.lifting import OFFICIAL_OFFSET_M
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[1] / "configs"
 IMAGE_SIZE = (32, 48)
@@ -141,6 +142,19 @@ def projections(count: int) -> np.ndarray:
 def images(count: int) -> np.ndarray:
     rng = np.random.default_rng(1)
     return rng.integers(0, 256, (count, *IMAGE_SIZE, 3), dtype=np.uint8)
+
+
+def official_calibration() -> CameraCalibration:
+    """The camera of the released DinoRADE, from a golden file."""
+    file = np.load(CONFIGS.parent / "tests" / "golden" / "dinorade_geometry.npz")
+    matrix, extrinsics = file["intrinsics"], file["extrinsics"]
+    return CameraCalibration(
+        intrinsics=matrix[[0, 1, 0, 1], [0, 1, 2, 2]],
+        distortion=np.zeros(5),
+        rotation=extrinsics[:, :3],
+        translation_m=extrinsics[:, 3],
+        radar_from_lidar_m=OFFICIAL_OFFSET_M,
+    )
 
 
 def calibration(**fields: Any) -> CameraCalibration:

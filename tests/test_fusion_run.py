@@ -10,7 +10,6 @@ import shutil
 import jax
 import numpy as np
 import pytest
-import safetensors.numpy
 from click.testing import CliRunner
 
 from radejax.cli.main import main
@@ -21,7 +20,6 @@ from radejax.data.kradar.radar_files import key_of
 from radejax.data.records import open_embeddings
 from radejax.inference.detect_files import detect_files, find_inputs
 from radejax.inference.detector import Detector
-from radejax.inference.embed import embed_dataset
 from radejax.inference.predict import predict_dataset
 from radejax.inference.saved import load_model
 from radejax.models import build
@@ -111,100 +109,95 @@ def from_images(data):
     return data.train("images", image_backbone=str(data.backbone))
 
 
+def embed(data, config, out, *options):
+    """Run `radejax embed` and return its result."""
+    path = small.write_config(data.runs / "config.py", config)
+    command = ["embed", str(data.folder), "--config", str(path), "--out", str(out)]
+    command += ["--image-backbone", str(data.backbone), *options]
+    return CliRunner().invoke(main, command)
+
+
 @pytest.fixture(scope="module")
 def embeddings(data, from_images, tmp_path_factory):
     out = tmp_path_factory.mktemp("embeddings")
-    model = build(small_config().model)
-    variables = image_backbone.load_image_backbone(data.backbone, model)
-    frames = opened(from_images)[1].frames
-    arguments = (model, variables, frames, out)
-    counts = embed_dataset(*arguments)
-    assert counts == {"frames": 12, "embedded": 12, "found": 0, "missing": 0}
-    counts = embed_dataset(*arguments)
-    assert counts == {"frames": 12, "embedded": 0, "found": 12, "missing": 0}
+    for counts in ("12 frames, 12 embedded, 0 found", "12 frames, 0 embedded, 12"):
+        assert counts in embed(data, small_config(), out).output
+    wrong = small_config().with_fields({"model.image.size": (16, 48)})
+    assert "other records: shape is" in embed(data, wrong, out).output
+    found = open_embeddings(out)
+    assert (found.shape, np.dtype(found.dtype)) == ((2, 6, 96), np.float32)
     return out
 
 
+@pytest.fixture(scope="module")
+def from_embeddings(data, embeddings):
+    return data.train("embedded", embeddings=str(embeddings))
+
+
 def test_frozen_backbone_is_in_no_checkpoint_and_comes_back(data, from_images):
-    config = small_config()
-    run = load_model(from_images)
-    given = image_backbone.load_image_backbone(data.backbone, build(config.model))
-    backbone = run.variables["params"]["image_backbone"]
-    for found, wanted in zip(
-        jax.tree.leaves(backbone),
-        jax.tree.leaves(given["params"]["image_backbone"]),
-        strict=True,
-    ):
-        np.testing.assert_array_equal(found, wanted)
-    stored = json.dumps(
-        [str(p) for p in (from_images / "checkpoints").rglob("*")]
-    ) + "".join(p.read_text() for p in (from_images / "checkpoints").rglob("_METADATA"))
-    assert "image_neck" in stored
-    assert "image_backbone" not in stored
+    variables = load_model(from_images).variables
+    model = build(small_config().model)
+    given = image_backbone.load_image_backbone(data.backbone, model)["params"]
+    assert_same(variables["params"]["image_backbone"], given["image_backbone"])
+    stored = from_images / "checkpoints"
+    names = [*map(str, stored.rglob("*"))]
+    names += [path.read_text() for path in stored.rglob("_METADATA")]
+    assert "image_neck" in "".join(names)
+    assert "image_backbone" not in "".join(names)
 
 
-def test_training_from_embeddings_is_the_same(data, from_images, embeddings, tmp_path):
-    workdir = data.train("embedded", embeddings=str(embeddings))
-    found, wanted = data.losses(workdir), data.losses(from_images)
+def assert_same(found, wanted):
+    jax.tree.map(np.testing.assert_array_equal, found, wanted)
+
+
+def test_training_from_embeddings_is_the_same(from_images, from_embeddings, data):
+    found, wanted = data.losses(from_embeddings), data.losses(from_images)
     assert len(found) == len(wanted) > 0
     np.testing.assert_allclose(found, wanted, rtol=2e-5)
     # The evaluation uses the embeddings too: the backbone's weights do not exist.
-    assert "image_backbone" not in load_model(workdir).variables["params"]
+    assert "image_backbone" not in load_model(from_embeddings).variables["params"]
     reports = [
-        json.loads((w / "evaluation" / "metrics.json").read_text())
-        for w in (workdir, from_images)
+        json.loads((run / "evaluation" / "metrics.json").read_text())["ap"]
+        for run in (from_embeddings, from_images)
     ]
-    assert reports[0]["ap"] == reports[1]["ap"]
+    assert reports[0] == reports[1]
+
+
+def test_evaluation_shows_the_share_of_the_camera(from_images):
+    path = from_images / "evaluation" / "camera_share.json"
+    share = json.loads(path.read_text())["all"]
+    assert share["frames"] == 4
+    assert 0 < share["mean"] < 1
+
+
+def test_example_compares_fusion_and_radar_by_the_lens(
+    data, from_images, tmp_path, monkeypatch
+):
+    # Intervals resample sequences, of which the test split has only one.
+    split = data.folder / "split"
+    texts = [(split / f"{name}.txt").read_text() for name in ("test", "train")]
     other = shutil.copytree(data.folder, tmp_path / "other")
-    with pytest.raises(UserError, match=r"\(--image-backbone FOLDER\)"):
-        evaluate_run(workdir, other={"roots": (str(other),)})
-    given = {"roots": (str(other),), "embeddings": str(embeddings)}
-    evaluate_run(workdir, other=given, num_visualizations=0)
-    report = json.loads((workdir / "evaluation_other/metrics.json").read_text())
-    assert report["ap"] == reports[0]["ap"]
-
-
-def test_dinov2_embeds_and_trains_like_dinov3(data, golden, tmp_path):
-    # 32 x 96 pixels are no multiples of the patch size: the model resizes them to 28 x 98.
-    seeds = load_module(golden / "backbones_make.py")
-    info = json.loads(str(np.load(golden / "backbones.npz")["info"]))
-    listing = info["dinov2_registers"]
-    backbone, embeddings = tmp_path / "dinov2", tmp_path / "embeddings"
-    backbone.mkdir()
-    (backbone / "config.json").write_text(json.dumps(listing["config"]))
-    safetensors.numpy.save_file(
-        seeds.tensors(listing["tensors"]), backbone / "model.safetensors"
-    )
-
-    image = {"hidden_size": 32, "num_layers": 2, "num_heads": 2, "mlp_dim": 128}
-    image |= {"patch_size": 14, "position_grid": 4}
-    config = small_config().replace(model={"image": image})
-    with pytest.raises(UserError, match=r"dinov3 is DINOv3, .* 16 there and 14 here"):
-        data.train("other", config, image_backbone=str(data.backbone))
-    images = data.train("dinov2_images", config, image_backbone=str(backbone))
-    path = small.write_config(tmp_path / "config.py", config)
-    arguments = ["embed", str(data.folder), "--config", str(path), "--out"]
-    arguments += [str(embeddings), "--image-backbone", str(backbone)]
-    result = CliRunner().invoke(main, arguments, catch_exceptions=False)
-    assert "12 frames, 12 embedded" in result.output
-    assert open_embeddings(embeddings).shape == (2, 7, 32)
-    embedded = data.train("dinov2_embedded", config, embeddings=str(embeddings))
-    found, wanted = data.losses(embedded), data.losses(images)
-    np.testing.assert_allclose(found, wanted, rtol=2e-5)
+    (other / "split" / "test.txt").write_text("\n".join(texts))
+    run = shutil.copytree(from_images, tmp_path / "run")
+    evaluate_run(run, num_visualizations=0, other={"roots": (str(other),)})
+    script = load_module(CONFIG.parents[1] / "examples" / "fusion_by_lens.py")
+    arguments = [str(run), str(run), "--data", str(other), "--resamples", "10"]
+    result = CliRunner().invoke(script.main, arguments)
+    assert result.exit_code == 0, result.output
+    # A run compared with itself has no gain.
+    rows = json.loads((run / "by_lens_other" / "by_lens.json").read_text())["ap"]
+    assert {row["frames"] for row in rows if row["condition"] == "all"} == {12}
+    assert {row["difference"] for row in rows} == {0.0}
 
 
 def test_a_run_that_starts_from_another_keeps_its_backbone(data, from_images):
     # Without --image-backbone, the initial weights include the backbone's.
-    workdir = data.train("continued", init_from=str(from_images))
-    assert (workdir / "evaluation" / "metrics.json").exists()
-    first, second = (load_model(w).variables for w in (from_images, workdir))
-    for name, is_same in (("image_backbone", True), ("image_neck", False)):
-        pairs = zip(
-            jax.tree.leaves(first["params"][name]),
-            jax.tree.leaves(second["params"][name]),
-            strict=True,
-        )
-        assert all(np.array_equal(a, b) for a, b in pairs) == is_same
+    config = small_config().replace(train={"num_epochs": 1})
+    workdir = data.train("continued", config, init_from=str(from_images))
+    first, second = (load_model(w).variables["params"] for w in (from_images, workdir))
+    assert_same(first["image_backbone"], second["image_backbone"])
+    with pytest.raises(AssertionError):
+        assert_same(first["image_neck"], second["image_neck"])
 
 
 def test_a_backbone_that_is_gone_leaves_embedded_images(
@@ -229,8 +222,8 @@ def test_a_backbone_that_is_gone_leaves_embedded_images(
     assert "image_backbone" in again.variables["params"]
 
 
-def test_images_that_are_not_embedded_are_an_error(data, embeddings):
-    _, own = opened(data.runs / "images")
+def test_images_that_are_not_embedded_are_an_error(from_images, embeddings):
+    _, own = opened(from_images)
     frames = list(own.split("test"))
     embedded = copy.copy(own)
     embedded.features = open_embeddings(embeddings)
@@ -246,41 +239,6 @@ def test_images_that_are_not_embedded_are_an_error(data, embeddings):
     inputs = own.images(gone)
     with pytest.raises(UserError, match=r"\(4\) can use the camera: 4 have no front"):
         require_images(gone, inputs)
-
-
-def test_embeddings_of_another_kind_are_rejected(data, embeddings, make, tmp_path):
-    config = small_config().with_fields({"model.image.standardize": False})
-    with pytest.raises(UserError, match=r"standardize is True there and False here"):
-        open_embeddings(embeddings, config.model.image.to_dict())
-    paths = {"roots": (str(data.folder),), "records": str(data.folder / "records")}
-    paths["embeddings"] = str(embeddings)
-    for changes, message in (
-        ({"data.mirror_probability": 0.5}, "cannot be mirrored"),
-        ({"model.image.freeze": False}, "freeze=True"),
-    ):
-        config = small_config().replace(data=paths).with_fields(changes)
-        with pytest.raises(UserError, match=message):
-            Data(config, build(config.model))
-    with pytest.raises(FileNotFoundError, match="radejax embed"):
-        open_embeddings(tmp_path)
-    (tmp_path / "records.json").write_text('{"shape": [2, 3]}')
-    with pytest.raises(DataError, match=r"records\.json: corrupted"):
-        open_embeddings(tmp_path)
-
-
-def test_weights_that_do_not_fit_are_rejected(data, tmp_path):
-    config = small_config()
-    with pytest.raises(UserError, match="--image-backbone FOLDER"):
-        image_backbone.load_image_backbone(None, build(config.model))
-    with pytest.raises(FileNotFoundError, match=r"lacks config.json"):
-        image_backbone.load_image_backbone(tmp_path, build(config.model))
-    config = config.with_fields({"model.image.num_layers": 12})
-    with pytest.raises(UserError, match=r"num_layers is 3 .* 12 here"):
-        image_backbone.load_image_backbone(data.backbone, build(config.model))
-    radar = build(load_config(f"{CONFIG}:radar").model)
-    with pytest.raises(UserError, match="has no camera"):
-        image_backbone.load_image_backbone(data.backbone, radar)
-    assert image_backbone.load_image_backbone(None, radar) is None
 
 
 def test_frames_without_image_are_counted_and_predicted_by_radar(
@@ -312,8 +270,7 @@ def test_frames_without_image_are_counted_and_predicted_by_radar(
 
 def test_detect_finds_the_images_by_the_labels(from_images, tmp_path):
     frames = list(opened(from_images)[1].split("test"))
-    path = frames[0].projection_path
-    folder = path.parents[1]
+    folder = frames[0].projection_path.parents[1]
     root = tmp_path / "kradar"
     others = [x.name for x in folder.parent.iterdir() if x.name.isdecimal()]
     others.remove(folder.name)
@@ -323,119 +280,24 @@ def test_detect_finds_the_images_by_the_labels(from_images, tmp_path):
         out = tmp_path / name
         detector = Detector.from_workdir(from_images, score_threshold=0.0)
         counts = detect_files(detector, find_inputs(detector, [root]), out)
-        boxes = {path.name: json.loads(path.read_text()) for path in out.iterdir()}
-        assert counts["frames"] == len(boxes) == len(frames)
-        assert counts["boxes"] == sum(map(len, boxes.values()))
-        return counts["radar_only"], boxes
+        assert counts["frames"] == len(list(out.iterdir())) == len(frames)
+        key = key_of(frames[0].projection_path).replace("/", "_")
+        return counts["radar_only"], json.loads((out / f"{key}.json").read_text())
 
     none_missing, seen = detect("seen")
     assert none_missing == 0
     detector = Detector.from_workdir(from_images, score_threshold=0.0)
-    frame = frames[0]
-    expected = detector(
-        path, [frame.camera_path], [frame.camera_calibration_path]
-    ).to_list()[0]
-    name = f"{key_of(path).replace('/', '_')}.json"
-    assert [box["x"] for box in seen[name]] == pytest.approx(
-        [box["x"] for box in expected], abs=1e-3
-    )
-
-    calib = (root / "calib").rename(tmp_path / "repository")
-    command = ["detect", str(root), "--workdir", str(from_images)]
-    command += ["--score-threshold", "0", "--out", str(tmp_path / "command")]
-    failed = CliRunner().invoke(main, command)
-    assert failed.exit_code == 2
-    assert "4 no camera calibration" in failed.output
-    command += ["--camera-calibration", str(calib)]
-    done = CliRunner().invoke(main, command, catch_exceptions=False)
-    assert "radar only" not in done.stdout
-    given = json.loads((tmp_path / "command" / name).read_text())
-    assert given == seen[name]
-    calib.rename(root / "calib")
-
-    (root / folder.name / "cam-front" / frame.camera_path.name).unlink()
+    files = [frames[0].camera_path], [frames[0].camera_calibration_path]
+    (expected,) = detector(frames[0].projection_path, *files).to_list()
+    found_x, expected_x = ([box["x"] for box in boxes] for boxes in (seen, expected))
+    assert found_x == pytest.approx(expected_x, abs=1e-3)
+    (root / folder.name / "cam-front" / frames[0].camera_path.name).unlink()
     one_missing, blind = detect("blind")
     assert one_missing == 1
-    assert blind.keys() == seen.keys()
-    assert blind[name] != seen[name]
-
+    assert blind != seen
     for labels in (root / folder.name).glob("info_label*"):
         shutil.rmtree(labels)
-    all_missing, _ = detect("unlabelled")
-    assert all_missing == len(frames)
-
-
-def test_evaluation_shows_the_share_of_the_camera(from_images, tmp_path):
-    evaluate_run(from_images, out=tmp_path, num_visualizations=0)
-    shares = json.loads((tmp_path / "camera_share.json").read_text())
-    assert shares["all"]["frames"] == 4
-    assert 0 < shares["all"]["mean"] < 1
-
-
-def _example(name, *arguments):
-    path = CONFIG.parents[1] / "examples" / f"{name}.py"
-    module = load_module(path)
-    result = CliRunner().invoke(module.main, [str(a) for a in arguments])
-    assert result.exit_code == 0, result.output
-    return result.stdout
-
-
-@pytest.fixture
-def three_test_sequences(data):
-    """The training split joins the test split: intervals resample sequences."""
-    split = data.folder / "split"
-    before = (split / "test.txt").read_text()
-    (split / "test.txt").write_text(before + "\n" + (split / "train.txt").read_text())
-    yield
-    (split / "test.txt").write_text(before)
-
-
-def test_example_compares_fusion_and_radar_by_the_lens(
-    from_images, three_test_sequences, tmp_path
-):
-    out, run = tmp_path / "by_lens", shutil.copytree(from_images, tmp_path / "run")
-    evaluate_run(run, num_visualizations=0)
-    # A run compared with itself has no gain, on all frames and by state of the lens.
-    text = _example("fusion_by_lens", run, run, "--out", out, "--resamples", 10)
-    assert (out / "by_lens.txt").read_text() in text
-    content = json.loads((out / "by_lens.json").read_text())
-    rows = content["ap"]
-    whole = [row for row in rows if row["condition"] == "all"]
-    assert {row["frames"] for row in whole} == {12}
-    assert {row["difference"] for row in rows} == {0.0}
-    shares = json.loads((out / "camera_share.json").read_text())
-    parts = set(shares) - {"all"}
-    assert sum(shares[name]["frames"] for name in parts) == 12
-    # Three sequences in different weather: a condition with one sequence has no interval.
-    alone = {n for n in parts if f"left out: {n} (4 frames" in text}
-    told = {row["condition"]: row for row in content["share"]}
-    assert told.keys() == {row["condition"] for row in rows}
-    assert parts - alone == told.keys() - {"all"}
-    for name, row in told.items():
-        # Averages over frames and over bins must agree.
-        assert row["share"] == pytest.approx(shares[name]["mean"], abs=0.02)
-        assert row["frames"] == shares[name]["frames"]
-        assert 0 < row["share low"] <= row["share"] <= row["share high"] < 1
-    assert told["all"]["difference"] == 0
-
-
-def test_example_compares_on_another_data_set(
-    data, from_images, three_test_sequences, tmp_path, monkeypatch
-):
-    run = shutil.copytree(from_images, tmp_path / "run")
-    other = shutil.copytree(data.folder, tmp_path / "other")
-    for data in (None, {"roots": (str(other),)}):
-        evaluate_run(run, num_visualizations=0, other=data)
-    results = []
-    monkeypatch.chdir(other)
-    for arguments in ((), ("--data", ".")):
-        _example("fusion_by_lens", run, run, *arguments, "--resamples", 10)
-    for name in ("by_lens", "by_lens_other"):
-        results.append((run / name / "by_lens.json").read_text())
-    assert results[0] == results[1]
-    assert len(json.loads(results[0])["ap"]) > 1
-    with pytest.raises(AssertionError, match="other frames than split train"):
-        _example("fusion_by_lens", run, run, "--split", "train")
+    assert detect("unlabelled")[0] == len(frames)
 
 
 def test_other_data_without_cameras_are_an_error(data, from_images, tmp_path):
@@ -448,70 +310,35 @@ def test_other_data_without_cameras_are_an_error(data, from_images, tmp_path):
     assert not (other / "records").exists()
 
 
-def test_example_draws_reference_points(data, from_images, tmp_path):
-    frame = opened(from_images)[1].split("test")[0]
-    files = frame.camera_path, frame.camera_calibration_path
-    (label,) = (data.folder / str(frame.sequence)).glob(f"info_label*/{frame.name}.txt")
-    out = tmp_path / "points.png"
-    text = _example("reference_points", *files, "--label", label, "--out", out)
-    share, count = float(text.split("%")[0]), int(text.split("drew ")[1].split()[0])
-    assert 5 < share < 100
-    assert count > 50
-    assert out.stat().st_size > 10_000
+def test_what_does_not_fit_is_rejected(data, from_images, embeddings, tmp_path):
+    config, radar = small_config(), load_config(f"{CONFIG}:radar")
+    paths = {"roots": (str(data.folder),), "records": str(data.folder / "records")}
+    paths["embeddings"] = str(embeddings)
 
+    def load(config, folder=data.backbone):
+        return image_backbone.load_image_backbone(folder, build(config.model))
 
-def test_embeddings_grow_with_a_second_disk(data, from_images, tmp_path):
-    disk = tmp_path / "disk1"
-    second = shutil.copytree(data.folder, tmp_path / "disk2")
-    shutil.rmtree(second / "records")
-    disk.mkdir()
-    (second / "1").rename(disk / "1")
-    for name in ("radar_grid.json", "split", "calib", "simulation.json"):
-        if (second / name).is_dir():
-            shutil.copytree(second / name, disk / name)
-        else:
-            shutil.copy(second / name, disk / name)
-    wrong = small_config().with_fields({"model.image.size": (32, 80)})
-    out = tmp_path / "out"
+    def open_data(fields):
+        changed = config.replace(data=paths).with_fields(fields)
+        return Data(changed, build(changed.model))
 
-    def embed(*roots, config, options=()):
-        path = small.write_config(tmp_path / "config.py", config)
-        command = ["embed", *map(str, roots), "--config", str(path), "--out", str(out)]
-        command += ["--image-backbone", str(data.backbone), *options]
-        return CliRunner().invoke(main, command)
-
-    failed = embed(disk, config=wrong)
-    assert failed.exit_code == 1
-    assert "expected 160 x 32 (stereo) or 80 x 32" in failed.output
-    half = ("--dtype", "float16")
-    done = embed(disk, config=small_config(), options=half)
-    assert "4 embedded, 0 found" in done.output, done.output
-    done = embed(disk, second, config=small_config())
-    assert "8 embedded, 4 found" in done.output, done.output
-    assert len(open_embeddings(out).keys()) == 12
-    paths = {"roots": (str(disk), str(second)), "embeddings": str(out)}
-    paths["records"] = str(tmp_path / "records")
-    config = small_config().replace(data=paths)
-    own = Data(config, build(config.model))
-    assert own.images(own.frames).image(11).dtype == np.float16
-    other = embed(disk, config=wrong)
-    assert "other records: shape is" in other.output
-
-
-def test_embed_command(data, from_images, tmp_path, monkeypatch):
-    config = small.write_config(tmp_path / "config.py", small_config())
-    command = ["embed", str(data.folder), "--config", str(config)]
-    command += ["--image-backbone", str(data.backbone), "--out", str(tmp_path / "out")]
-    result = CliRunner().invoke(main, command, catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    assert "12 embedded" in result.stdout
-    # Without a folder, the config's dataset is simulated again.
-    monkeypatch.chdir(tmp_path)
-    command = ["embed", *command[2:], "--out", "again"]
-    result = CliRunner().invoke(main, command, catch_exceptions=False)
-    assert "12 embedded" in result.stdout
-    (made,) = (tmp_path / "data").glob("simulated-*")
-    assert (made / "1" / "cam-front").is_dir()
-    half = open_embeddings(tmp_path / "out")
-    assert np.dtype(half.dtype) == np.float32
-    assert half.shape == (2, 6, 96)
+    plain = config.with_fields({"model.image.standardize": False}).model.image
+    deeper = config.with_fields({"model.image.num_layers": 12})
+    (tmp_path / "records.json").write_text('{"shape": [2, 3]}')
+    for call, message in (
+        (lambda: load(config, None), "--image-backbone FOLDER"),
+        (lambda: load(config, tmp_path), "lacks config.json"),
+        (lambda: load(deeper), "num_layers is 3 .* 12 here"),
+        (lambda: load(radar), "has no camera"),
+        (
+            lambda: open_embeddings(embeddings, plain.to_dict()),
+            "standardize is True there and False here",
+        ),
+        (lambda: open_data({"data.mirror_probability": 0.5}), "cannot be mirrored"),
+        (lambda: open_data({"model.image.freeze": False}), "freeze=True"),
+        (lambda: open_embeddings(tmp_path / "nothing"), "radejax embed"),
+        (lambda: open_embeddings(tmp_path), r"records\.json: corrupted"),
+    ):
+        with pytest.raises((UserError, DataError, FileNotFoundError), match=message):
+            call()
+    assert load(radar, None) is None

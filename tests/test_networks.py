@@ -33,20 +33,3 @@ def test_figures_have_the_models_shapes_and_no_texts_overlap(name: str) -> None:
     texts = [text.get_window_extent(renderer) for text in axes.texts]
     for one, other in itertools.combinations(texts, 2):
         assert not one.overlaps(other), (one, other)
-    frames = [
-        patch.get_window_extent(renderer)
-        for patch in axes.patches
-        if type(patch).__name__ == "FancyBboxPatch"
-    ]
-    assert len(frames) == len(sheet.blocks)
-    for one, other in itertools.combinations(frames, 2):
-        assert not one.overlaps(other), (one, other)
-    for text in texts:  # within its own block or outside all blocks
-        met = [frame for frame in frames if frame.overlaps(text)]
-        assert len(met) <= 1
-        for frame in met:
-            assert frame.x0 <= text.x0
-            assert text.x1 <= frame.x1
-            assert frame.y0 <= text.y0
-            assert text.y1 <= frame.y1
-    assert all(figure.bbox.x0 <= t.x0 and t.x1 <= figure.bbox.x1 for t in texts)

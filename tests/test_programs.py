@@ -15,7 +15,6 @@ from radejax.models.deformable_attention import DeformableAttention
 from tests import small_models
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
-PLATFORMS = ("cuda", "tpu")
 TOKENS = 2 * 3 + 5
 """Of the small ViT: patches, class and registers."""
 
@@ -69,13 +68,6 @@ def test_accelerators_get_lean_programs(
     assert [shape for shape in found["turned"] if f"x{TOKENS}" not in shape] == []
 
 
-@pytest.mark.slow
-def test_programs_for_accelerators_lack_the_loops_for_cpus(facts: Any) -> None:
-    """Only loops over cache-sized blocks are particular to CPUs."""
-    assert facts("radar", "train_step", "cpu")["ops"]["while"] > 0
-    assert facts("radar", "train_step", "cuda")["ops"]["while"] == 0
-
-
 def test_bins_are_sampled_in_large_steps(programs: types.ModuleType) -> None:
     """This holds wherever the program is exported: one exported on a CPU runs on a GPU."""
     bins, shape = 4096, programs.shape_of
@@ -97,36 +89,3 @@ def test_bins_are_sampled_in_large_steps(programs: types.ModuleType) -> None:
         text = programs.text_of(gradient, (variables, *arguments), platform)
         sampled = f"tensor<{chunk}x3x2x4x"  # [bins, E, P, 4]
         assert sampled in text, platform
-
-
-@pytest.mark.parametrize("platform", PLATFORMS)
-def test_simulated_rows_are_made_together(
-    programs: types.ModuleType, platform: str
-) -> None:
-    function, arguments = programs.simulator(GRID, num_scatterers=8)
-    text = programs.text_of(function, arguments, platform)
-    found = programs.facts(text)
-    assert not found["types"] & {"f64", "i64", "ui64"}
-    assert not found["calls"]
-    assert "tensor<64x3x2x2x62xf32>" in text  # [rows, E, D, 2, A]
-    alone = programs.text_of(function, arguments, "cpu")
-    assert "tensor<64x3x2x2x62xf32>" not in alone
-
-
-@pytest.mark.slow
-def test_work_is_what_the_compiler_counts(programs: types.ModuleType) -> None:
-    """Operations of a radar detector, without loops that the compiler counts once."""
-    widths = {"widths": (32, 32), "decoder_width": 32}
-    config = small_models.radar_config().replace(model=widths)
-    function, arguments = programs.detector(config, GRID, 1)
-    found = programs.work(function, arguments, "cuda")
-    ours = sum(flops * times for _, _, flops, _, times in found)
-    theirs = jax.jit(function).trace(*arguments).lower(lowering_platforms=("cuda",))
-    assert ours == pytest.approx(theirs.cost_analysis()["flops"], rel=0.1)
-    # Every iteration of a loop is counted.
-    step = lambda x, _: (x @ x, None)  # noqa: E731
-    loop = lambda x: jax.lax.scan(step, x, None, length=5)[0]  # noqa: E731
-    looped = programs.work(loop, (programs.shape_of(8, 8),), "cuda")
-    assert [(f, times) for _, _, f, _, times in looped] == [(2 * 8**3, 5)]
-    least = programs.least_seconds(looped, "H100")
-    assert least == pytest.approx(5 * 3 * 256 / 3.35e12)

@@ -33,10 +33,6 @@ def boxes(checked: Checked) -> types.ModuleType:
     return checked("radejax.geometry.boxes")
 
 
-def test_fitting_arrays_pass(boxes: types.ModuleType) -> None:
-    assert boxes.boxes8_from_7(np.zeros((2, 7)))[0].tolist() == [0] * 7 + [1]
-
-
 def test_a_wrong_shape_is_rejected_by_name(boxes: types.ModuleType) -> None:
     with pytest.raises(TypeCheckError, match="parameter 'boxes'"):
         boxes.boxes8_from_7(np.zeros((2, 8)))
@@ -56,8 +52,3 @@ def test_a_field_of_a_wrong_shape_is_rejected_by_name(checked: Checked) -> None:
     assert scene.Reflectors(np.zeros((2, 3)), flat, flat, kind).kind is kind
     with pytest.raises(TypeCheckError, match="parameter 'kind'"):
         scene.Reflectors(np.zeros((2, 3)), flat, flat, kind[:1])
-
-
-def test_trees_are_rebuilt_of_any_leaves(checked: Checked) -> None:
-    maps = checked("radejax.core.structures").DetectionMaps(None, "spec")
-    assert maps.box_params == "spec"

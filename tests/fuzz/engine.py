@@ -31,8 +31,11 @@ MAX_CPU_SECONDS = 3.0
 MAX_BYTES = 384 << 20  # of memory for one input, the largest of which have 4 MiB
 MAX_MESSAGE = 2500  # characters
 
-Outcome = tuple[int, str, str]
-"""Number of the input; "read", "refused CLASS", or what is wrong; and the message."""
+Job = tuple[str, int, int]
+"""Reader, number of its first input, and how many."""
+
+Outcome = tuple[str, int, str, str]
+"""Reader; number of the input; "read", "refused CLASS", or what is wrong; and the message."""
 
 
 class Reader(NamedTuple):
@@ -48,7 +51,7 @@ class Reader(NamedTuple):
     make: Callable[[pathlib.Path], object]
     read: Callable[[pathlib.Path], object]
     pattern: str
-    count: int = 500
+    count: int = 200
 
 
 class Case:
@@ -75,8 +78,8 @@ class Case:
         path, content = rng.choice([*self._seeds * 9, *self._known])
         return path, mutate(rng, content)
 
-    def judge(self, number: int) -> Outcome:
-        """Read an input and return the outcome."""
+    def judge(self, number: int) -> tuple[int, str, str]:
+        """Read an input and return the outcome of it."""
         path, content = self.content(number)
         before = dict(self._seeds)[path]
         path.write_bytes(content)
@@ -109,28 +112,30 @@ def _memory() -> int:
     return 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 
 
-def serve(name: str, start: int, count: int) -> None:
+def serve(jobs: list[Job]) -> None:
     """Read inputs in the child and write a line per outcome."""
     from .readers import READERS
 
-    with tempfile.TemporaryDirectory() as folder:
-        case = Case(name, READERS[name], pathlib.Path(folder))
-        pages = int(pathlib.Path("/proc/self/statm").read_text().split()[5])
-        limit = pages * resource.getpagesize() + 2 * MAX_BYTES
-        resource.setrlimit(resource.RLIMIT_DATA, (limit, resource.RLIM_INFINITY))
-        warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", "", DeprecationWarning, "(?!radejax)")
-        for number in range(start, start + count):
-            _, kind, text = case.judge(number)
-            print(number, kind, text, sep="\x1f", end="\x1e", flush=True)
+    pages = int(pathlib.Path("/proc/self/statm").read_text().split()[5])
+    limit = pages * resource.getpagesize() + 3 * MAX_BYTES
+    warnings.simplefilter("error")
+    warnings.filterwarnings("ignore", "", DeprecationWarning, "(?!radejax)")
+    for name, start, count in jobs:
+        with tempfile.TemporaryDirectory() as folder:
+            case = Case(name, READERS[name], pathlib.Path(folder))
+            resource.setrlimit(resource.RLIMIT_DATA, (limit, resource.RLIM_INFINITY))
+            for number in range(start, start + count):
+                found = name, *case.judge(number)
+                print(*found, sep="\x1f", end="\x1e", flush=True)
+            resource.setrlimit(resource.RLIMIT_DATA, (resource.RLIM_INFINITY,) * 2)
 
 
-def run(name: str, start: int, count: int) -> Iterator[Outcome]:
-    """Yield the outcomes of `count` inputs of a reader, in order."""
-    number, end = start, start + count
-    while number < end:
-        code = f"from tests.fuzz.engine import serve; serve({name!r}, {number}, "
-        command = [sys.executable, "-X", "faulthandler", "-c", f"{code}{end - number})"]
+def run(jobs: list[Job]) -> Iterator[Outcome]:
+    """Yield the outcomes of inputs, in order."""
+    jobs = list(jobs)
+    while jobs:
+        command = [sys.executable, "-X", "faulthandler", "-c"]
+        command += [f"from tests.fuzz.engine import serve; serve({jobs!r})"]
         path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
         env = {**os.environ, "PYTHONPATH": path, "JAX_PLATFORMS": "cpu"}
         with (
@@ -139,18 +144,26 @@ def run(name: str, start: int, count: int) -> Iterator[Outcome]:
                 command, cwd=ROOT, env=env, stdout=subprocess.PIPE, stderr=stderr
             ) as child,
         ):
-            for outcome in _outcomes(child, number):
+            for outcome in _outcomes(child):
                 yield outcome
-                number += 1
-            if number < end:
+                _advance(jobs)
+            if jobs:
                 kind = "hang" if child.poll() is None else f"crash: {child.returncode}"
                 child.kill()
                 stderr.seek(0)
-                yield number, kind, stderr.read().decode(errors="replace")[-3000:]
-                number += 1
+                text = stderr.read().decode(errors="replace")[-3000:]
+                yield jobs[0][0], jobs[0][1], kind, text
+                _advance(jobs)
 
 
-def _outcomes(child: subprocess.Popen, number: int) -> Iterator[Outcome]:
+def _advance(jobs: list[Job]) -> None:
+    """Remove the first input."""
+    name, start, count = jobs.pop(0)
+    if count > 1:
+        jobs.insert(0, (name, start + 1, count - 1))
+
+
+def _outcomes(child: subprocess.Popen) -> Iterator[Outcome]:
     """Outcomes that the child writes until it ends or hangs."""
     assert child.stdout is not None
     text = b""
@@ -161,14 +174,16 @@ def _outcomes(child: subprocess.Popen, number: int) -> Iterator[Outcome]:
             return
         *lines, text = (text + data).split(b"\x1e")
         for line in lines:
-            found, kind, message = line.decode(errors="replace").split("\x1f", 2)
-            yield int(found), kind, message
+            name, found, kind, message = line.decode(errors="replace").split("\x1f", 3)
+            yield name, int(found), kind, message
 
 
-def counts(
-    name: str, start: int, count: int
-) -> tuple[collections.Counter, list[Outcome]]:
-    """Number of outcomes of each kind, and the wrong outcomes."""
-    outcomes = list(run(name, start, count))
-    wrong = [o for o in outcomes if not o[1].startswith(("read", "refused"))]
-    return collections.Counter(kind for _, kind, _ in outcomes), wrong
+def counts(jobs: list[Job]) -> dict[str, tuple[collections.Counter, list[Outcome]]]:
+    """By reader, the number of outcomes of each kind, and the wrong outcomes."""
+    outcomes = list(run(jobs))
+    found = {}
+    for name, _, _ in jobs:
+        own = [outcome for outcome in outcomes if outcome[0] == name]
+        wrong = [o for o in own if not o[2].startswith(("read", "refused"))]
+        found[name] = collections.Counter(kind for _, _, kind, _ in own), wrong
+    return found

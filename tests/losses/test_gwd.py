@@ -123,13 +123,6 @@ def test_closed_form_gradient_where_the_released_one_is_wrong(pairs):
     np.testing.assert_array_less(np.abs(grad[kept] - expected[kept]) / size, 2e-5)
 
 
-def test_golden_pairs_are_the_reference(pairs, shared):
-    reference = np.load(shared / "fixtures/gwd/gwd_pairs.npz")
-    assert pairs["kind"].size == 229
-    for name in reference:
-        np.testing.assert_array_equal(pairs[name], reference[name])
-
-
 def test_roots_of_the_released_code(pairs):
     # It puts the width where we put the length: the same root, turned by 90 degrees.
     turn = np.array([[0, -1], [1, 0]])
@@ -177,22 +170,6 @@ def test_gradients_by_finite_differences(transform):
             np.asarray(loss(a + s, b[None], transform=transform)) for s in (step, -step)
         )
     np.testing.assert_allclose(found, (plus - minus).T / 2e-5, atol=1e-7)
-
-
-@pytest.mark.parametrize("matrix", [(4.0, 0.0, 4.0), (4.0, 1.0, 3.0)])
-def test_derivative_of_the_trace_of_the_root(matrix):
-    # d tr(S) = tr(S^-1 dM) / 2, also where both eigenvalues are equal.
-    tangent = (0.3, -0.7, 1.1)
-    full, change = (np.array([[m[0], m[1]], [m[1], m[2]]]) for m in (matrix, tangent))
-    root = scipy.linalg.sqrtm(full)
-    expected = np.trace(np.linalg.solve(root, change)) / 2
-    with jax.enable_x64(True):
-        place, step = tuple(jnp.asarray(matrix)), tuple(jnp.asarray(tangent))
-        trace, found = jax.jvp(G.trace_of_root_2x2, place, step)
-        reverse = jax.grad(G.trace_of_root_2x2, (0, 1, 2))(*place)
-    np.testing.assert_allclose(trace, np.trace(root))
-    np.testing.assert_allclose(found, expected)
-    np.testing.assert_allclose(np.dot(reverse, tangent), expected)
 
 
 numbers = st.tuples(

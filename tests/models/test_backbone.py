@@ -16,17 +16,6 @@ from radejax.models.backbone import (
 from .. import small_models as small
 
 
-def test_input_stem_equals_official(module_case, run_like_torch):
-    x, expected = module_case("input_stem")
-    names = {
-        f"{part}/{ours}": f"{part}_conv.{theirs}"
-        for part in ("doppler", "elevation", "mix")
-        for ours, theirs in (("conv", "0"), ("norm", "1"))
-    }
-    actual = run_like_torch(InputStem(128, 64, 32), names, x)
-    np.testing.assert_allclose(actual, expected, atol=1e-5)
-
-
 @pytest.mark.parametrize("widths", [(16,), (16, 32), (16, 32, 48, 64)])
 def test_any_number_of_levels(widths):
     backbone = Backbone(8, widths, decoder_width=24, num_groups=8)
@@ -59,7 +48,13 @@ def test_skips_are_joined_after_the_upsampled_map():
     np.testing.assert_array_equal(backbone.apply(variables, x), y)
 
 
-NAMES = {
+STEM = {
+    f"{part}/{ours}": f"{part}_conv.{theirs}"
+    for part in ("doppler", "elevation", "mix")
+    for ours, theirs in (("conv", "0"), ("norm", "1"))
+}
+CHANNEL = {"squeeze": "fc1", "excite": "fc2"}
+BLOCK = {
     "channel/squeeze": "channel_attention.fc1",
     "channel/excite": "channel_attention.fc2",
     "spatial/conv": "spatial_attention.convolution",
@@ -70,23 +65,21 @@ NAMES = {
 }
 
 
-@pytest.mark.parametrize("case", ["channel_attention", "channel_attention_small"])
-def test_channel_attention_equals_official(case, module_case, run_like_torch):
+@pytest.mark.parametrize(
+    ("case", "module", "names"),
+    [
+        ("input_stem", InputStem(128, 64, 32), STEM),
+        ("channel_attention", ChannelAttention(), CHANNEL),
+        ("channel_attention_small", ChannelAttention(), CHANNEL),
+        ("spatial_attention", SpatialAttention(), {"conv": "convolution"}),
+        ("cbam_block", CBAM("official", 32), BLOCK),
+    ],
+)
+def test_parts_equal_the_official_ones(
+    case, module, names, module_case, run_like_torch
+):
     x, expected = module_case(case)
-    names = {"squeeze": "fc1", "excite": "fc2"}
-    actual = run_like_torch(ChannelAttention(), names, x)
-    np.testing.assert_allclose(actual, expected, atol=1e-5)
-
-
-def test_spatial_attention_equals_official(module_case, run_like_torch):
-    x, expected = module_case("spatial_attention")
-    actual = run_like_torch(SpatialAttention(), {"conv": "convolution"}, x)
-    np.testing.assert_allclose(actual, expected, atol=1e-5)
-
-
-def test_official_block_equals_official(module_case, run_like_torch):
-    x, expected = module_case("cbam_block")
-    actual = run_like_torch(CBAM("official", 32), NAMES, x)
+    actual = run_like_torch(module, names, x)
     np.testing.assert_allclose(actual, expected, atol=1e-5)
 
 

@@ -26,30 +26,6 @@ def test_map_grid_follows_padding_and_cropping() -> None:
     assert not models.has_camera(model)
 
 
-CHOICES = {
-    "name": "radenet",
-    "backbone": "unet",
-    "neck": "dilated",
-    "heads": "expanded",
-    "cbam": "official",
-    "dtype": "bfloat16",
-    "remat": "blocks",
-    "image.kind": "resnet50",
-    "image.attention": "blocked",
-    "fusion.weighting": "mlp",
-    "fusion.gate": "bin",
-    "fusion.out_of_view": "official",
-}
-
-
-@pytest.mark.parametrize("field", CHOICES)
-def test_an_unknown_name_is_rejected_with_those_that_there_are(field: str) -> None:
-    config = small.camera_config()
-    words = rf"config.model.{field} is 'wide'.*'{CHOICES[field]}'"
-    with pytest.raises(UserError, match=words):
-        config.with_fields({f"model.{field}": "wide"})
-
-
 def test_options_of_another_model_are_rejected() -> None:
     with pytest.raises(UserError, match=r"'RadeNetOptions', expected DinoRadeOptions"):
         models.build(RadeNetOptions(name="dinorade"))

@@ -14,8 +14,6 @@ from radejax.data.projection import stack_frames
 from radejax.geometry.camera import stack_cameras
 from radejax.models import build, lifting
 from radejax.models.lifting import ReferencePoints
-from radejax.models.options import OFFICIAL_DINORADE, RadeNetOptions
-from radejax.models.radenet import RadeNet
 
 from .. import small_models
 from ..small_models import calibration, drawn
@@ -61,28 +59,6 @@ def model_and_variables():
 def applied():
     model, _ = model_and_variables()
     return jax.jit(model.apply)
-
-
-def test_shapes_and_parts():
-    _, variables = model_and_variables()
-    maps = applied()(variables, *batch())
-    chex.assert_shape(maps.heatmap_logits, (B, R, A, 2))
-    chex.assert_shape(maps.box_params, (B, R, A, 8))
-    chex.assert_tree_all_finite(maps)
-    radar, image = {"backbone", "neck", "heads"}, ("backbone", "neck", "fusion")
-    assert set(variables["params"]) == radar | {f"image_{name}" for name in image}
-
-
-def test_radar_parts_have_the_names_of_radenet():
-    model, variables = model_and_variables()
-    assert isinstance(model, RadeNet)
-    fields = {
-        name: getattr(model.options, name) for name in RadeNetOptions.model_fields
-    }
-    radar = RadeNet(RadeNetOptions(**fields))
-    shapes = jax.eval_shape(radar.init, jax.random.key(0), batch()[0])["params"]
-    ours = {k: variables["params"][k] for k in ("backbone", "neck", "heads")}
-    chex.assert_trees_all_equal_shapes(ours, shapes)
 
 
 def test_elevation_weights_are_those_of_the_last_frame():
@@ -191,34 +167,10 @@ def test_frames_without_an_image_fall_back_to_the_radar():
     assert np.abs(whole[1] - alone[1]).max() > 1e-3
 
 
-def test_a_frozen_backbone_has_no_gradient():
-    model, variables = model_and_variables()
-
-    @jax.jit
-    @jax.grad
-    def gradient(params):
-        maps, _ = model.apply(
-            variables | {"params": params},
-            *batch(),
-            train=True,
-            rngs={"dropout": jax.random.key(0)},
-            mutable=["batch_stats"],
-        )
-        return jnp.sum(maps.heatmap_logits**2) + jnp.sum(maps.box_params**2)
-
-    grads = gradient(variables["params"])
-    chex.assert_tree_all_finite(grads)
-    sizes = jax.tree.map(lambda g: float(np.abs(g).max()), grads)
-    assert not any(jax.tree.leaves(sizes.pop("image_backbone")))
-    assert np.mean(np.array(jax.tree.leaves(sizes)) > 0) > 0.9
-    assert model.is_frozen("image_backbone/norm/scale")
-    assert not model.is_frozen("image_neck/proj/kernel")
-    assert not model.is_frozen("backbone/stem/mix/conv/kernel")
-
-
-def test_a_backbone_that_is_trained_has_gradients():
-    model = small(**{"image.freeze": False})
+@pytest.mark.parametrize("is_frozen", [True, False])
+def test_only_a_frozen_backbone_has_no_gradient(is_frozen):
     _, variables = model_and_variables()
+    model = small(**{"image.freeze": is_frozen})
     params = {"image_backbone": variables["params"]["image_backbone"]}
 
     @jax.jit
@@ -227,9 +179,11 @@ def test_a_backbone_that_is_trained_has_gradients():
         features = model.apply({"params": params}, batch()[1], method="embed")
         return jnp.sum(features**3)
 
-    grads = gradient(params)
-    assert all(np.abs(g).max() > 0 for g in jax.tree.leaves(grads))
-    assert not model.is_frozen("image_backbone/norm/scale")
+    grads = jax.tree.leaves(gradient(params))
+    assert all((np.abs(g).max() > 0) != is_frozen for g in grads)
+    assert model.is_frozen("image_backbone/norm/scale") == is_frozen
+    assert not model.is_frozen("image_neck/proj/kernel")
+    assert not model.is_frozen("backbone/stem/mix/conv/kernel")
 
 
 def test_resnet_in_place_of_the_transformer():
@@ -241,15 +195,6 @@ def test_resnet_in_place_of_the_transformer():
     # The last stage is trained and lies outside what is frozen.
     assert "block_3" in variables["params"]["image_neck"]
     assert "image_backbone" not in variables["batch_stats"]
-
-
-def test_half_precision():
-    model = small(dtype="bfloat16")
-    _, variables = model_and_variables()
-    maps = jax.jit(model.apply)(variables, *batch())
-    assert maps.heatmap_logits.dtype == jnp.float32
-    exact = applied()(variables, *batch())
-    assert np.abs(maps.heatmap_logits - exact.heatmap_logits).max() < 0.3
 
 
 @pytest.mark.parametrize(
@@ -279,17 +224,6 @@ def test_parameters_at_full_size(variant, trained, frozen):
     assert frozen[0] <= inside <= frozen[1]
 
 
-def test_variants_differ_where_their_names_say():
-    assert load_config("dinorade").model.fusion.out_of_view == "drop"
-    assert load_config("dinorade:rc").model.fusion.weighting == "off"
-    model = load_config("dinorade:official,rcw_resnet50").model
-    assert not model.image.standardize
-    assert load_config("dinorade:rcw,sedan").model.num_classes == 1
-    assert load_config("dinorade:official").model == OFFICIAL_DINORADE
-    with pytest.raises(UserError, match="unknown config option 'rcx'"):
-        load_config("dinorade:rcx")
-
-
 @pytest.mark.wrong_types
 def test_images_of_another_size_are_rejected():
     model, variables = model_and_variables()
@@ -302,7 +236,7 @@ def test_images_of_another_size_are_rejected():
         (r"reference points are \(1, 4, 8, 3\), expected", (image, short)),
     ):
         with pytest.raises(UserError, match=message):
-            model.apply(variables, projection, *arguments)
+            jax.eval_shape(model.apply, variables, projection, *arguments)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Tests of `radejax.models.layers`; torch's numbers are in the shared fixtures."""
+"""Tests of `radejax.models.layers`; torch's numbers are in `released.npz`."""
 
 import chex
 import jax
@@ -16,23 +16,27 @@ from radejax.models.layers import (
     uniform_fan_in,
 )
 
-
-def test_double_conv_residual_equals_official(module_case, run_like_torch):
-    x, expected = module_case("double_conv_residual")
-    names = {
-        "shortcut": "adjust_input",
-        "conv_1/conv": "double_conv.0.single_conv.0",
-        "conv_1/norm": "double_conv.0.single_conv.1",
-        "conv_2/conv": "double_conv.1.single_conv.0",
-        "conv_2/norm": "double_conv.1.single_conv.1",
-    }
-    actual = run_like_torch(DoubleConvResidual(64, 32), names, x)
-    np.testing.assert_allclose(actual, expected, atol=1e-5)
+DOUBLE = {
+    "shortcut": "adjust_input",
+    "conv_1/conv": "double_conv.0.single_conv.0",
+    "conv_1/norm": "double_conv.0.single_conv.1",
+    "conv_2/conv": "double_conv.1.single_conv.0",
+    "conv_2/norm": "double_conv.1.single_conv.1",
+}
 
 
-def test_upsample_equals_official(module_case, run_like_torch):
-    x, expected = module_case("upsample")
-    actual = run_like_torch(Upsample(16), {"": "upsample"}, x)
+@pytest.mark.parametrize(
+    ("case", "module", "names"),
+    [
+        ("double_conv_residual", DoubleConvResidual(64, 32), DOUBLE),
+        ("upsample", Upsample(16), {"": "upsample"}),
+    ],
+)
+def test_parts_equal_the_official_ones(
+    case, module, names, module_case, run_like_torch
+):
+    x, expected = module_case(case)
+    actual = run_like_torch(module, names, x)
     np.testing.assert_allclose(actual, expected, atol=1e-5)
 
 

@@ -19,19 +19,6 @@ AXES = QueryGridOptions(
 )
 
 
-def official_calibration(golden) -> CameraCalibration:
-    """Matrices of the golden geometry file."""
-    file = np.load(golden / "dinorade_geometry.npz")
-    matrix, extrinsics = file["intrinsics"], file["extrinsics"]
-    return CameraCalibration(
-        intrinsics=matrix[[0, 1, 0, 1], [0, 1, 2, 2]],
-        distortion=np.zeros(5),
-        rotation=extrinsics[:, :3],
-        translation_m=extrinsics[:, 3],
-        radar_from_lidar_m=lifting.OFFICIAL_OFFSET_M,
-    )
-
-
 def ahead(**fields) -> CameraCalibration:
     """A camera of 100 x 80 pixels in the radar's place, looking along x."""
     settings = {"intrinsics": (50.0, 50.0, 50.0, 40.0), "width": 100, "height": 80}
@@ -73,16 +60,22 @@ def check_official(reference, index, points, is_valid):
     )
 
 
-def test_released_reference_points(golden):
+def test_released_reference_points(golden, released):
     file = np.load(golden / "dinorade_geometry.npz")
-    axes, camera = (
-        QueryGridOptions.official(),
-        official_calibration(golden).camera("pinhole"),
-    )
+    axes, camera = QueryGridOptions.official(), small.official_calibration()
+    camera = camera.camera("pinhole")
     on_host = lifting.reference_points(camera, axes, 256, 112, 10, "official")
     chex.assert_shape(on_host.points, (1, 256, 112, 10, 2))
     assert on_host.points.dtype == np.float32
     check_official(on_host, file["index"], file["reference_points_f64"], file["valid"])
+    masks = released("dinorade/geometry").items()
+    masks = {name: np.unpackbits(mask).astype(bool) for name, mask in masks}
+    is_clear = ~masks["near_mask_border_packed"]
+    is_valid = on_host.is_valid.ravel()[is_clear]
+    np.testing.assert_array_equal(is_valid, masks["valid_packed"][is_clear])
+    # Without the released crop 95.3 % of the queries lie in the image.
+    whole = lifting.reference_points(camera, axes, 256, 112, 10)
+    assert whole.is_valid.mean() == pytest.approx(0.953, abs=5e-4)
     # In the program, in float32, for two cameras.
     cameras = stack_cameras([camera] * 2)
     in_program = jax.jit(
@@ -90,27 +83,6 @@ def test_released_reference_points(golden):
     )(jax.tree.map(jnp.asarray, cameras))
     second = jax.tree.map(lambda x: x[1], in_program)
     check_official(second, file["index"], file["reference_points_f64"], file["valid"])
-
-
-def test_released_mask_of_all_queries(shared):
-    folder = shared / "fixtures" / "dinorade"
-    file = np.load(folder / "geometry.npz")
-    calibration = CameraCalibration.from_kradar(
-        shared / "data/kradar/calib/common/cam_front0.yml",
-        radar_from_lidar_m=lifting.OFFICIAL_OFFSET_M,
-    )
-    camera, axes = calibration.camera("pinhole"), QueryGridOptions.official()
-    reference = lifting.reference_points(camera, axes, 256, 112, 10, "official")
-    check_official(
-        reference, file["index"], file["reference_points_f64"], file["valid"]
-    )
-    expected = np.unpackbits(file["valid_packed"]).astype(bool)
-    is_clear = ~np.unpackbits(file["near_mask_border_packed"]).astype(bool)
-    is_valid = reference.is_valid.ravel()
-    np.testing.assert_array_equal(is_valid[is_clear], expected[is_clear])
-    # Without the released crop 95.3 % of the queries lie in the image.
-    whole = lifting.reference_points(camera, axes, 256, 112, 10)
-    assert whole.is_valid.mean() == pytest.approx(0.953, abs=5e-4)
 
 
 def test_queries_outside_the_image_are_invalid_and_clipped():
@@ -173,26 +145,6 @@ def test_elevation_weights_sum_to_one(kind):
     changed = np.abs(jax.jit(network.apply)(variables, moved) - weights).max(-1) > 1e-7
     assert changed[:, 0, 0].all()
     assert changed[:, 1, 1].any() == (kind == "cnn")
-
-
-def test_mlp_weights_by_formula():
-    network = WeightingNetwork(3, "mlp")
-    elevation = np.random.default_rng(0).random((1, 2, 2, 5)).astype(np.float32)
-    variables = network.init(jax.random.key(0), jnp.asarray(elevation))
-    p = jax.tree.map(np.asarray, variables["params"])
-    hidden = np.maximum(elevation @ p["hidden"]["kernel"] + p["hidden"]["bias"], 0)
-    logits = np.exp(hidden @ p["out"]["kernel"] + p["out"]["bias"])
-    np.testing.assert_allclose(
-        network.apply(variables, jnp.asarray(elevation)),
-        logits / logits.sum(-1, keepdims=True),
-        atol=1e-6,
-    )
-
-
-def test_without_weights_queries_are_copies():
-    network = WeightingNetwork(6, "off")
-    weights = network.apply({}, jnp.zeros((1, 2, 3, 9)))
-    np.testing.assert_array_equal(weights, np.ones((1, 2, 3, 6)))
 
 
 def test_uneven_axes_are_given_by_all_centers_and_continue_into_padding():
