@@ -22,11 +22,11 @@ from online_batches import OnlineBatches
 from radejax import models
 from radejax.cli import entry
 from radejax.config import Config, load_config
+from radejax.core import devices
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
 from radejax.models.options import DinoRadeOptions
-from radejax.runs.experiment import checkpoint_info, claimed
-from radejax.training import distributed, loop
+from radejax.runs.experiment import TrainingData, checkpoint_info, claimed, fit
 from radejax.training.step import TrainState
 
 SEED_OFFSET = 2_000_003
@@ -74,7 +74,8 @@ def train_online(
         seed=simulation.seed + SEED_OFFSET,
     )
     batch_size = config.train.batch_size
-    distributed.check_batch_size(batch_size)
+    mesh = devices.make_mesh()
+    devices.check_batch_size(batch_size, mesh)
     workdir = pathlib.Path(workdir).absolute()
     with claimed(workdir, config):
         batches = OnlineBatches(
@@ -88,20 +89,18 @@ def train_online(
             "%d frames to sample from, simulated when needed", len(batches.frame_names)
         )
         model = models.build(config.model)
-        state, _ = loop.train(
-            config,
-            model,
-            batches.loader(),
-            models.map_grid(batches.grid, model, config.data.azimuth_mapping),
-            workdir,
+        data = TrainingData(
+            batches=batches.loader(),
+            steps_per_epoch=max(len(batches.frame_names) // batch_size, 1),
+            grid=models.map_grid(batches.grid, model, config.data.azimuth_mapping),
             info=checkpoint_info(
                 config,
                 batches.grid,
                 {"online_sequences": num_sequences},
                 {"number of sequences": num_sequences},
             ),
-            steps_per_epoch=max(len(batches.frame_names) // batch_size, 1),
         )
+        state, _ = fit(config, model, data, workdir, mesh)
     return state
 
 

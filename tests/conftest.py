@@ -185,13 +185,22 @@ def _tolerances(
     monkeypatch.setattr(np.testing, "assert_allclose", wider)
 
 
-@pytest.fixture
-def one_device(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run trainings on one device, as compiling for eight takes long on few cores."""
-    from radejax.training import distributed
+@pytest.fixture(scope="session")
+def one_device() -> jax.sharding.Mesh:
+    """Mesh of one device, as compiling for eight takes long on few cores."""
+    from radejax.core import devices
 
-    mesh = distributed.make_mesh(1)
-    monkeypatch.setattr(distributed, "make_mesh", lambda *_: mesh)
+    return devices.make_mesh(1)
+
+
+@pytest.fixture
+def commands_on_one_device(
+    one_device: jax.sharding.Mesh, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Run commands, which use all devices, on one."""
+    from radejax.core import devices
+
+    monkeypatch.setattr(devices, "make_mesh", lambda *_: one_device)
 
 
 @pytest.fixture(scope="session")

@@ -13,7 +13,7 @@ JOIN = """
 import sys
 
 from radejax.cli.train import join_processes
-from radejax.training import distributed
+from radejax.core import devices
 
 coordinator, count, index = (word.partition("=")[2] for word in sys.argv[-3:])
 index = int(index)

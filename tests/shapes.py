@@ -25,7 +25,7 @@ PACKAGES = (
     "data.pipeline",
     "data.projection",
     "data.kradar.tesseract",
-    "training.distributed",
+    "core.devices",
     "training.step",
     "simulation",
     "inference.detector",

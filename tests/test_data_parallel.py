@@ -17,10 +17,10 @@ import optax
 import pytest
 
 from radejax import models
+from radejax.core import devices
 from radejax.core.structures import Batch
 from radejax.geometry.camera import stack_cameras
 from radejax.inference.inputs import UNBOUNDED_ROI
-from radejax.training import distributed
 from radejax.training.step import create_state, make_train_step
 
 from . import small_models
@@ -86,12 +86,12 @@ def _compiled(
 ) -> tuple[Any, Any]:
     """A step that is compiled for some devices, and its arguments on them."""
     _, batch, state, step = _case(kind)
-    mesh = distributed.make_mesh(num_devices)
-    whole = distributed.replicated(mesh)
-    placement = distributed.state_sharding(state, mesh, parameters, min_size=64)
+    mesh = devices.make_mesh(num_devices)
+    whole = devices.replicated(mesh)
+    placement = devices.state_sharding(state, mesh, parameters, min_size=64)
     arguments = (
         jax.device_put(state, placement),
-        distributed.put_batch(batch, mesh),
+        devices.put_batch(batch, mesh),
         jax.device_put(KEY, whole),
     )
     sharded = jax.jit(step, out_shardings=(placement, whole))
@@ -180,10 +180,8 @@ def test_devices_share_the_work_of_inference_and_gather_only_detections(
     )
     programs = []
     for num_devices in (1, 4):
-        mesh = distributed.make_mesh(num_devices)
-        detector = small_models.detector(
-            kind, sharding=distributed.batch_sharding(mesh)
-        )
+        mesh = devices.make_mesh(num_devices)
+        detector = small_models.detector(kind, sharding=devices.batch_sharding(mesh))
         arguments = detector.variables, *jax.tree.map(detector.put, inputs), settings
         program = detector._run.lower(*arguments).compile()
         programs.append((program, program(*arguments)))

@@ -271,22 +271,22 @@ def test_a_wrong_part_is_named(name: str, value: Any, message: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("one_device")
 def test_own_parts_are_imported_wherever_a_run_is_opened(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+    one_device: jax.sharding.Mesh,
 ) -> None:
     """One step on the toy data, then each command as if in a process of its own."""
     root, folder = _write_toy(tmp_path / "toy"), tmp_path / "run"
     config = _config()
     classes = ("Tram", *config.classes[1:])
-    experiment.run(
-        config.replace(data={"roots": (str(root),)}, classes=classes), folder
-    )
+    config = config.replace(data={"roots": (str(root),)}, classes=classes)
+    experiment.run(config, folder, mesh=one_device)
     row: dict[str, Any] = json.loads((folder / "metrics.jsonl").read_text())
     assert row["step"] == 1
     assert np.isfinite([row[name] for name in ("focal", "gwd", "height_loss")]).all()
     _forget()
-    assert evaluate_run(folder) is not None
+    assert evaluate_run(folder, mesh=one_device) is not None
     metrics = json.loads((folder / "evaluation" / "metrics.json").read_text())
     assert metrics["options"]["protocols"] == ["parts:EVERY_FRAME", "all_point"]
     _forget()

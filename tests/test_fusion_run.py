@@ -26,12 +26,15 @@ from radejax.models import build
 from radejax.runs import experiment
 from radejax.runs.data import Data, data_of_run
 from radejax.runs.evaluate import evaluate_run
-from radejax.training import checkpoints, distributed
+from radejax.training import checkpoints
 from radejax.weights import image_backbone
 
 from . import small_models as small
 
-pytestmark = pytest.mark.slow  # several programs to compile
+pytestmark = [
+    pytest.mark.slow,  # several programs to compile
+    pytest.mark.usefixtures("commands_on_one_device"),
+]
 
 CONFIG = pathlib.Path(__file__).parents[1] / "configs" / "quickstart_fusion.py"
 
@@ -69,12 +72,13 @@ class _Data:
     folder: pathlib.Path
     backbone: pathlib.Path
     runs: pathlib.Path
+    mesh: jax.sharding.Mesh
 
     def train(self, name, config=None, init_from=None, **paths):
         data = paths | {"roots": (str(self.folder),)}
         config = (config or small_config()).replace(data=data)
         workdir = self.runs / name
-        experiment.run(config, workdir, init_from=init_from)
+        experiment.run(config, workdir, init_from=init_from, mesh=self.mesh)
         return workdir
 
     def losses(self, workdir):
@@ -88,20 +92,13 @@ def opened(workdir):
     return loaded, data_of_run(loaded)[1]
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_device():
-    """One device only: compiling for eight takes long and is tested elsewhere."""
-    mesh = distributed.make_mesh(1)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(distributed, "make_mesh", lambda *_: mesh)
-        yield
-
-
 @pytest.fixture(scope="module")
-def data(tmp_path_factory, make):
+def data(tmp_path_factory, make, one_device):
     root = tmp_path_factory.mktemp("fusion")
     (root / "dinov3").mkdir()
-    return _Data(root / "data", make.write_tiny_folder(root / "dinov3"), root)
+    return _Data(
+        root / "data", make.write_tiny_folder(root / "dinov3"), root, one_device
+    )
 
 
 @pytest.fixture(scope="module")

@@ -256,7 +256,8 @@ def points(
     from radejax.data.records import PreprocessReport
 
     frames = find_frames(paths, sequence_numbers, weather)
-    sources, skipped = dict[pathlib.Path, pathlib.Path](), dict[str, str]()
+    sources = dict[pathlib.Path, pathlib.Path]()
+    skipped = dict[str, str]()
     for path in frames:
         name = f"rpc_{path.stem.rpartition('_')[2]}.{suffix}"
         target = out.absolute() / sequence_folder(path).name / name

@@ -94,9 +94,13 @@ def _message(error: BaseException) -> str:
 def set_up_jax() -> None:
     """Sets up logging at level info and JAX's persistent compilation cache."""
     from absl import flags
+    from absl import logging as absl_logging
 
     log = logging.getLogger("radejax")
     if not log.handlers:
+        # Orbax logs what it does and raises its errors too, so that its log is not needed.
+        absl_log = absl_logging.get_absl_logger()
+        absl_log.addFilter(lambda record: "orbax" not in record.pathname)
         handler = logging.StreamHandler()
         handler.setFormatter(logging.Formatter("%(message)s"))
         log.addHandler(handler)
@@ -109,23 +113,11 @@ def set_up_jax() -> None:
 # Commands ----------------------------------------------------------------------------
 
 
-class Program(click.Command):
-    """A command with `-h` and the defaults of its options in the help."""
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.context_settings["help_option_names"] = ["-h", "--help"]
-        self.context_settings["show_default"] = True
-
-    def main(self, args: Any = None, *others: Any, **options: Any) -> Any:
-        """Runs the command with the given arguments, by default those of this process."""
-        if args is None:
-            sys.path.append(os.getcwd())  # for `config.data.format=module:Class`
-        return super().main(args, *others, **options)
-
-
-class Group(Program, click.Group):
-    """The group of commands of one program."""
+SETTINGS: dict[str, Any] = {
+    "help_option_names": ["-h", "--help"],
+    "show_default": True,
+}
+"""Settings of a program, which its commands inherit."""
 
 
 def expand_home(arguments: list[str]) -> list[str]:
@@ -136,14 +128,15 @@ def expand_home(arguments: list[str]) -> list[str]:
     return [_HOME.sub(lambda m: os.path.expanduser(m[0]), arg) for arg in arguments]
 
 
-class Command(Program):
+class Command(click.Command):
     """A command that reports user errors in one line with an exit code.
 
-    Every command has the option `--debug`, which shows their tracebacks instead.
+    Every command has the option `--debug`, which shows their tracebacks instead. Modules in
+    the current folder can be imported, such as those of `config.data.format=module:Class`.
     """
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(context_settings=SETTINGS, **settings)
         text = "Show tracebacks of user errors."
         self.params.append(click.Option(["--debug"], is_flag=True, help=text))
 
@@ -166,6 +159,8 @@ class Command(Program):
 
     def invoke(self, ctx: click.Context) -> Any:
         with exit_codes(debug=ctx.params.pop("debug")):
+            if os.getcwd() not in sys.path:
+                sys.path.append(os.getcwd())
             return super().invoke(ctx)
 
 

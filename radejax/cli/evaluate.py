@@ -101,8 +101,14 @@ _PREDICTIONS = together(
     group="Data",
 )
 _OTHER_DATA = (
-    *("data", "labels", "label_version", "sequences", "weather"),
-    *("records", "camera_calibration", "embeddings"),
+    "data",
+    "labels",
+    "label_version",
+    "sequences",
+    "weather",
+    "records",
+    "camera_calibration",
+    "embeddings",
 )
 
 

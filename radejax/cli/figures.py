@@ -120,7 +120,8 @@ def _draw(frames: Any, frame: Any, slices: bool, lidar: bool, roi: str) -> Any:
     from radejax.data.kradar.points import read_lidar
     from radejax.visualize.draw import draw_slices
 
-    grid, fields = frames.grid, dict[str, Any](roi=ROIS.get(roi))
+    grid = frames.grid
+    fields = dict[str, Any](roi=ROIS.get(roi))
     if lidar:
         points_m = read_lidar(frames.lidar_path(frame))
         fields["lidar_m"] = points_m + frame.radar_from_lidar_m

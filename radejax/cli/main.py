@@ -12,12 +12,25 @@ from radejax.cli.figures import demo, overlay, view
 from radejax.cli.train import train
 
 _COMMANDS = (
-    *(demo, simulate, data, reduce, points, preprocess, overlay, view),
-    *(train, evaluate, score, compare, detect, embed, export),
+    demo,
+    simulate,
+    data,
+    reduce,
+    points,
+    preprocess,
+    overlay,
+    view,
+    train,
+    evaluate,
+    score,
+    compare,
+    detect,
+    embed,
+    export,
 )
 
 
-@click.group(cls=entry.Group, commands=_COMMANDS)
+@click.group(commands=_COMMANDS, context_settings=entry.SETTINGS)
 @click.version_option(package_name="radejax")
 def main() -> None:
     """3D object detection in 4D radar tensors: data, training, figures."""

@@ -101,8 +101,8 @@ def train(
     Example: radejax train --config radenet:official --data /disk1/kradar,/disk2/kradar
     """
     from radejax.config import config_name, load_config, with_texts
+    from radejax.core.devices import end_with_others
     from radejax.runs.experiment import run, run_seeds
-    from radejax.training.distributed import end_with_others
 
     settings = with_texts(load_config(config), ctx.meta["fields"])
     data["sequences"] = sequence_numbers

@@ -12,13 +12,13 @@ import numpy as np
 import tqdm
 from jaxtyping import Int
 
+from radejax.core.devices import Stopped, is_main
 from radejax.core.structures import Array, Boxes
 from radejax.data.cameras import CameraInputs
 from radejax.data.dataset import FrameSequence
 from radejax.data.pipeline import LoaderOptions, make_loader, make_table
 from radejax.data.records import Records
 from radejax.inference.detector import Detector
-from radejax.training import distributed
 
 Batches = Iterable[tuple[Int[Array, " B"], Any]]
 """Indices of the frames of batches (-1 for padding), and items of `Detector.stream`."""
@@ -88,7 +88,7 @@ def predict_dataset(
 
     Raises:
         UserError: There are no frames.
-        distributed.Stopped: `should_stop` returned True.
+        Stopped: `should_stop` returned True.
     """
     table = make_table(
         records,
@@ -116,9 +116,9 @@ def predict_dataset(
     def batches() -> Iterator[tuple[jax.Array, Any]]:
         for batch in make_loader(table, options):
             if should_stop is not None and should_stop():
-                raise distributed.Stopped
+                raise Stopped
             yield gather(detector.put(batch.frame)), batch
 
-    progress = progress and distributed.is_main()
+    progress = progress and is_main()
     parts = detect_batches(detector, [batches()], len(frames), progress=progress)
     return Boxes.concatenate([boxes for _, boxes in parts])

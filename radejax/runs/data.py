@@ -15,6 +15,7 @@ import jax
 import numpy as np
 
 from radejax.config import Config, check_bins
+from radejax.core import devices
 from radejax.core.errors import UserError, require
 from radejax.core.files import as_path
 from radejax.core.structures import Batch
@@ -34,7 +35,6 @@ from radejax.inference.saved import SavedModel
 from radejax.models.options import DinoRadeOptions, RadeNetOptions
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
-from radejax.training import distributed
 from radejax.training.options import TrainOptions
 
 _log = logging.getLogger(__name__)
@@ -73,11 +73,13 @@ class Data:
         self.classes = tuple(config.classes)
         self.camera: CameraOptions | None = None
         self.features: Records | None = None
-        self._model, self._skipped = model, set[str]()
+        self._model = model
+        self._skipped = set[str]()
         self._splits: dict[str, LabelledFrames] = {}
         image = None
         if isinstance(config.model, DinoRadeOptions):
-            self.camera, image = options.used_camera, config.model.image
+            self.camera = options.used_camera
+            image = config.model.image
         if options.embeddings is not None:
             if image is None or not image.freeze or options.mirror_probability:
                 raise UserError(
@@ -102,7 +104,7 @@ class Data:
             UserError: There are no frames, the folder contains records of another kind,
                 or no space is left on the disk.
         """
-        report = distributed.main_only(
+        report = devices.main_only(
             lambda: records.preprocess(self._chosen(self.frames), self._records_folder)
         )
         if report is not None and report.skipped:
@@ -165,7 +167,8 @@ class Data:
             )
         if not chosen or not len(frames):
             return frames
-        numbers, is_train = {frame.sequence for frame in frames}, name == "train"
+        is_train = name == "train"
+        numbers = {frame.sequence for frame in frames}
         held = held_out(numbers, chosen, self.options.validation_seed)
         others = {f.key for f in frames if (f.sequence in held) == is_train}
         reason = "held out for validation" if is_train else "of sequences to train on"
@@ -220,8 +223,9 @@ class Data:
         require(is_useful, "config.data.num_frames", count, expected)
         if (shuffled := options.label_permutation_seed) is not None:
             order = np.random.default_rng(shuffled).permutation(len(table))
-            boxes, classes = table.boxes[order], table.classes[order]
-            table = dataclasses.replace(table, boxes=boxes, classes=classes)
+            table = dataclasses.replace(
+                table, boxes=table.boxes[order], classes=table.classes[order]
+            )
         augment = Augmentation(self.records.grid, options.mirror_probability)
         size = train.batch_size // jax.process_count()
         loader = pipeline.LoaderOptions(size, seed, num_threads=options.num_threads)
@@ -240,7 +244,8 @@ def located(config: Config) -> Config:
         FileNotFoundError: A path of `config.data` does not exist. The records and
             simulated data may be missing, because a run creates them.
     """
-    options, roots = config.data, config.data.roots
+    options = config.data
+    roots = options.roots
     if config.simulation is not None:
         one = "one folder, as the config simulates it"
         require(len(roots) <= 1, "config.data.roots", roots, one)
@@ -288,9 +293,10 @@ def simulate_missing(config: Config) -> None:
     Args:
         config: Config of the run with absolute paths, see `located`.
     """
-    simulation, root = config.simulation, config.data.roots[0]
+    simulation = config.simulation
     if simulation is not None:
-        distributed.main_only(lambda: simulate_dataset(simulation, root))
+        root = config.data.roots[0]
+        devices.main_only(lambda: simulate_dataset(simulation, root))
 
 
 def open_data(config: Config, model: nn.Module) -> Data:
@@ -315,7 +321,8 @@ def open_data(config: Config, model: nn.Module) -> Data:
         _log.warning(
             "%d frames are not used, as they are in neither the train nor the test split; "
             "the first is %s",
-            *(len(unused), unused[0]),
+            len(unused),
+            unused[0],
         )
     # Preprocessing can take hours, so the data are checked before it.
     check_bins(config.model, data.frames.grid, f"the radar of {data.options.roots[0]}")
@@ -354,7 +361,9 @@ def _log_input(data: Data, model: RadeNetOptions) -> None:
         _log.warning(
             "the network sees a nearly constant input, other than that of K-Radar "
             "(%.3f): set --config.model.input_center=%.3f --config.model.input_scale=%.3g",
-            *(_KRADAR_INPUT, mean, 0.5 / max(spread, 1e-6)),
+            _KRADAR_INPUT,
+            mean,
+            0.5 / max(spread, 1e-6),
         )
 
 
@@ -388,7 +397,8 @@ def data_of_run(
         changes = {"sequences": (), "weather": (), **paths} | changes
     config = _with_paths(saved.config.replace(data=changes), roots)
     data = Data(config, saved.model)
-    found, name = data.frames.grid, f"the radar of {config.data.roots[0]}"
+    found = data.frames.grid
+    name = f"the radar of {config.data.roots[0]}"
     expected = f"{records.describe_grid(saved.grid)}, as the model was trained"
     require(found == saved.grid, name, records.describe_grid(found), expected)
     return config, data

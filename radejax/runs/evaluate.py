@@ -11,10 +11,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from jax.sharding import Mesh
 from matplotlib.figure import Figure
 
 from radejax.config import Config
-from radejax.core import files
+from radejax.core import devices, files
 from radejax.core.errors import UserError
 from radejax.core.structures import Boxes
 from radejax.data.cameras import require_images
@@ -35,8 +36,7 @@ from radejax.inference.predict import predict_dataset
 from radejax.inference.saved import PathLike, SavedModel, Step, load_model
 from radejax.runs import figures
 from radejax.runs.data import Data, data_name, data_of_run
-from radejax.training import distributed
-from radejax.training.metric_logger import Scores
+from radejax.training.metric_writer import Scores
 from radejax.visualize import curves
 from radejax.visualize.draw import draw_frame, draw_scenes
 from radejax.visualize.style import Scene, save_figure
@@ -54,6 +54,7 @@ class Evaluation:
         data: Data to evaluate on.
         split: "test", "validation", "train", "all" or the path of a split file.
         shuffle_images: Seed for shuffling the images, or None; see `evaluate_run`.
+        mesh: Devices of all processes, see `make_mesh`; all if None.
         **changes: Fields of `ReportOptions` to replace.
 
     Raises:
@@ -67,9 +68,12 @@ class Evaluation:
         split: str = "test",
         *,
         shuffle_images: int | None = None,
+        mesh: Mesh | None = None,
         **changes: Any,
     ) -> None:
-        self._config, self._data, self._split = config, data, split
+        self._config = config
+        self._data = data
+        self._split = split
         options = self._options = report_options(config, **changes)
         self._source = source_of(data, split, shuffle_images)
         self._frames = data.split(split)
@@ -79,7 +83,8 @@ class Evaluation:
         self._images = data.images(self._seen)
         self._truth, self._table = tables_from_frames(self._frames, split)
         saved = SavedModel(config, data.records.grid, {})
-        placement = distributed.batch_sharding(distributed.make_mesh())
+        mesh = devices.make_mesh() if mesh is None else mesh
+        placement = devices.batch_sharding(mesh)
         self._detector = Detector(saved, placement, score_threshold=options.min_score)
 
     def predict(self, variables: Mapping[str, Any], **options: Any) -> Boxes:
@@ -116,7 +121,7 @@ class Evaluation:
                 the evaluation.
 
         Raises:
-            distributed.Stopped: `should_stop` returned True.
+            devices.Stopped: `should_stop` returned True.
         """
         predictions = self.predict(variables, progress=False, should_stop=should_stop)
         data = make_set(self._truth, predictions.columns(), self._table, self._options)
@@ -125,7 +130,7 @@ class Evaluation:
         main = f"{self._config.train.best_metric}/{self._options.protocols[0]}/"
         best = next((ap for name, ap in aps.items() if name.startswith(main)), math.nan)
         shown = self._spread(self._config.logging.num_visualizations)
-        drawn = distributed.main_only(lambda: dict(self._figures(predictions, shown)))
+        drawn = devices.main_only(lambda: dict(self._figures(predictions, shown)))
         values = {f"validation/{name}": ap for name, ap in aps.items()}
         named = {f"validation/{name}": figure for name, figure in (drawn or {}).items()}
         return Scores(values, None if math.isnan(best) else best, named)
@@ -172,14 +177,14 @@ class Evaluation:
                 self._write_figures(predictions, workdir, folder, worst)
             return dataclasses.replace(report, folder=place)
 
-        return distributed.main_only(write)
+        return devices.main_only(write)
 
     def _write_camera_share(
         self, variables: Mapping[str, Any], path: pathlib.Path
     ) -> None:
         """Write the mean weight of the camera by weather, computed on up to 256 frames."""
-        model, some = self._detector.model, figures.spread(self._frames, 256)
-        maps = figures.frame_shares(model, variables, self._data, some)
+        some = figures.spread(self._frames, 256)
+        maps = figures.frame_shares(self._detector.model, variables, self._data, some)
         shares = ((frame.weather, share) for frame, share in maps)
         grid = self._data.records.grid
         files.write_json(path, figures.average_shares(shares, grid))
@@ -218,7 +223,8 @@ class Evaluation:
         Predictions are drawn if their score reaches `config.decode.score_threshold`, the
         default of the detector.
         """
-        frame, records = self._frames[index], self._data.records
+        frame = self._frames[index]
+        records = self._data.records
         threshold = self._config.decode.score_threshold
         found = predictions.take(predictions.frame == index)
         assert found.score is not None  # of predictions
@@ -292,6 +298,7 @@ def evaluate_run(
     shuffle_images: int | None = None,
     other: Mapping[str, Any] | None = None,
     run: str | None = None,
+    mesh: Mesh | None = None,
     **changes: Any,
 ) -> Report | None:
     """Evaluate a checkpoint of a run with the settings of its config, on all devices.
@@ -309,6 +316,7 @@ def evaluate_run(
             radar-camera model uses the images.
         other: Fields of `config.data` to replace, such as `{"roots": ("/data",)}`.
         run: Name of the run in the report; the workdir's name if None.
+        mesh: Devices of all processes, see `make_mesh`; all if None.
         **changes: Fields of `ReportOptions` to replace.
 
     Returns:
@@ -351,7 +359,7 @@ def evaluate_run(
             _check_source(workdir / name, source_of(data, split, shuffle_images))
     data.preprocess()
     evaluation = Evaluation(
-        config, data, split, shuffle_images=shuffle_images, **changes
+        config, data, split, shuffle_images=shuffle_images, mesh=mesh, **changes
     )
     place = files.as_path(out or workdir / name)
     return evaluation.report(

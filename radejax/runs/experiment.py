@@ -16,24 +16,30 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import dataclasses
+import functools
 import hashlib
 import json
 import logging
 import pathlib
 import shlex
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
+import flax.linen as nn
+import grain
 import jax
 import numpy as np
+from jax.sharding import Mesh
 
 import radejax
 from radejax import models
 from radejax.config import Config
-from radejax.core import files
+from radejax.core import devices, files
 from radejax.core.errors import require
 from radejax.core.files import PathLike
+from radejax.core.structures import Batch
 from radejax.data.dataset import FrameSequence
 from radejax.data.records import open_embeddings
 from radejax.evaluation.report import Table, number, numbers, write_tables
@@ -41,8 +47,21 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.saved import FROZEN_BACKBONE, starting_weights
 from radejax.runs.data import located, open_data
 from radejax.runs.evaluate import Evaluation, named_aps
-from radejax.training import distributed, loop
-from radejax.training.metric_logger import log_results
+from radejax.training import hooks, loop
+from radejax.training.checkpoints import Checkpoints
+from radejax.training.hooks import Hook
+from radejax.training.metric_writer import MetricWriter, Scores, log_results
+from radejax.training.step import (
+    Metrics,
+    TrainState,
+    Variables,
+    count_steps,
+    create_state,
+    initial_variables,
+    make_optimizer,
+    make_schedule,
+    make_train_step,
+)
 from radejax.weights.image_backbone import check_fits
 
 _log = logging.getLogger(__name__)
@@ -54,6 +73,7 @@ def run(
     *,
     init_from: PathLike | None = None,
     profile: PathLike = "",
+    mesh: Mesh | None = None,
 ) -> pathlib.Path:
     """Trains and evaluates a model, or continues an interrupted run.
 
@@ -64,6 +84,7 @@ def run(
             another model that `load_model` accepts.
         profile: Folder for a profiler trace of the steps `config.logging.profile_steps`;
             empty for no trace.
+        mesh: Devices of the run, see `make_mesh`; all if None.
 
     Returns:
         The absolute path of the workdir.
@@ -74,9 +95,15 @@ def run(
             left on the disk.
         FileNotFoundError: A path does not exist.
     """
-    config, folder = located(config), files.as_path(workdir).absolute()
-    distributed.check_batch_size(config.train.batch_size)
-    model, digest = models.build(config.model, config.data.num_frames), None
+    config = located(config)
+    folder = files.as_path(workdir).absolute()
+    mesh = devices.make_mesh() if mesh is None else mesh
+    devices.check_batch_size(config.train.batch_size, mesh)
+
+    # Weights --------------------------------------------------------------------------
+
+    model = models.build(config.model, config.data.num_frames)
+    digest = None
     if config.data.embeddings is not None:
         digest = open_embeddings(config.data.embeddings).source["weights_sha256"]
     variables, pretrained, frozen_sha256 = starting_weights(
@@ -84,7 +111,10 @@ def run(
     )
     if variables is not None:
         check_fits(model, variables, str(init_from))
+
     with claimed(folder, config):
+        # Data -------------------------------------------------------------------------
+
         data = open_data(config, model)
         frames, grid = data.split("train"), data.records.grid
         has_test = len(data.split("test", may_be_empty=True)) > 0
@@ -93,33 +123,46 @@ def run(
                 "no frames of the test split in %s: the run is trained and not evaluated",
                 ", ".join(data.options.roots),
             )
-        loader = data.training_batches(frames, config.train, config.seed)
         info = run_info(folder, init_from)
-        if distributed.is_main():
+        if devices.is_main():
             files.write_json(folder / "run.json", info)
+        training_data = TrainingData(
+            batches=data.training_batches(frames, config.train, config.seed),
+            steps_per_epoch=len(frames) // config.train.batch_size,
+            grid=models.map_grid(grid, model, config.data.azimuth_mapping),
+            info=checkpoint_info(
+                config, grid, info, _invariants(frames, frozen_sha256)
+            ),
+        )
+
+        # Model, state and training ----------------------------------------------------
+
+        def initial(batch: Batch) -> Variables:
+            return initial_variables(model, config.seed, batch, variables, pretrained)
+
         validate = None
         if config.train.evaluate_every_epochs:
-            validate = Evaluation(config, data, data.choosing_split).validate
-        same = _invariants(frames, frozen_sha256)
-        state, is_finished = loop.train(
+            evaluation = Evaluation(config, data, data.choosing_split, mesh=mesh)
+            validate = evaluation.validate
+        state, is_finished = fit(
             config,
             model,
-            loader,
-            models.map_grid(grid, model, config.data.azimuth_mapping),
+            training_data,
             folder,
-            info=checkpoint_info(config, grid, info, same),
-            steps_per_epoch=len(frames) // config.train.batch_size,
-            variables=variables,
-            pretrained=pretrained,
-            evaluate=validate,
+            mesh,
+            initial=initial,
+            validate=validate,
             profile=str(profile),
         )
         step = int(state.step)
         if not is_finished:
             _log.info("stopped at step %d; run the same command to continue", step)
             return folder
+
+        # Report -----------------------------------------------------------------------
+
         if has_test:
-            evaluation = Evaluation(config, data)
+            evaluation = Evaluation(config, data, mesh=mesh)
             report = evaluation.report(state.eval_variables, folder, step=step)
             if report is not None:
                 log_results(folder, step, named_aps(report.results))
@@ -127,13 +170,176 @@ def run(
     _log.info(
         "Done in %s. Evaluate again: radejax evaluate %s. Boxes of frames: radejax detect "
         "--workdir %s --out boxes FOLDER",
-        *(place, place, place),
+        place,
+        place,
+        place,
     )
     if config.train.evaluate_every_epochs:
         best = f"radejax evaluate {place} --checkpoint best"
         split = data.choosing_split
         _log.info("Best checkpoint, chosen on the %s split: %s", split, best)
     return folder
+
+
+# Training ----------------------------------------------------------------------------
+
+
+Validate = Callable[[Variables, Callable[[], bool]], Scores]
+"""Function that evaluates variables during training. Its arguments are the variables, with
+averaged parameters if there are any, and a function that returns whether to stop, which every
+process must call equally often. If that returns True, it raises `devices.Stopped`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainingData:
+    """What a model is trained on.
+
+    Attributes:
+        batches: Endless, checkpointable iterator over the batches of this process.
+        steps_per_epoch: Number of batches of one pass over the data.
+        grid: Grid of the model's maps.
+        info: Plain values that are saved in each checkpoint, see `checkpoint_info`. The
+            value of "same" must be the same whenever the run continues.
+    """
+
+    batches: grain.DatasetIterator[Batch]
+    steps_per_epoch: int
+    grid: RadarGrid
+    info: Mapping[str, Any]
+
+
+def fit(
+    config: Config,
+    model: nn.Module,
+    data: TrainingData,
+    workdir: pathlib.Path,
+    mesh: Mesh,
+    *,
+    initial: Callable[[Batch], Variables] | None = None,
+    validate: Validate | None = None,
+    profile: str = "",
+) -> tuple[TrainState, bool]:
+    """Trains a model for the configured epochs or steps, or continues from a checkpoint.
+
+    Args:
+        config: Config of the run, of which the fields `seed`, `train`, `loss`, `decode`
+            and `logging` are used.
+        model: Model, which is called as `model.apply(variables, *inputs, train=True)`.
+        data: Data to train on.
+        workdir: Folder of checkpoints and logs.
+        mesh: Devices to train on.
+        initial: Function from an empty batch to the variables of step 0, by
+            default `initial_variables` with the seed of the config.
+        validate: Function that is called every `evaluate_every_epochs` epochs and, unless
+            this field is 0, after the last step, see `Evaluation.validate`.
+        profile: Folder for a profiler trace of the steps `config.logging.profile_steps`,
+            counted from the first step of this call.
+
+    Returns:
+        The state, placed on all devices, and whether the training is finished. It is not
+        finished if a signal ended the training or its last evaluation early; the state is
+        saved in that case.
+
+    Raises:
+        DataError: No checkpoint can be restored, or the loss or gradient was not finite in
+            too many consecutive steps.
+        UserError: The run would continue with other data, the warm-up is too long, or no
+            space is left on the disk.
+    """
+    if initial is None:
+        initial = functools.partial(initial_variables, model, config.seed)
+    kept = config.train.checkpoints_to_keep
+    with contextlib.ExitStack() as stack:
+        checkpoints = Checkpoints(workdir / "checkpoints", max_to_keep=kept)
+        stack.enter_context(checkpoints)
+        state, step = _make_state_and_step(
+            config, model, data, mesh, checkpoints, initial
+        )
+        start = int(state.step)
+        num_steps = count_steps(config.train, data.steps_per_epoch)
+        writer = stack.enter_context(MetricWriter(workdir, config, start))
+        bar = stack.enter_context(hooks.ProgressBar(start, num_steps))
+        should_stop = stack.enter_context(devices.stop_on_signal(mesh))
+
+        throughput = hooks.Throughput(data.batches, start)
+        log = hooks.Log(config, data.steps_per_epoch, throughput, writer, bar)
+        check = hooks.CheckSkipped(config.train.max_skipped_steps)
+        save = hooks.Save(checkpoints, data.batches, data.info, check, start)
+        due = functools.partial(hooks.every, num_steps)
+        log_every_steps = config.train.log_every_steps
+        called: list[Hook] = [throughput, bar, due(log_every_steps, log)]
+        if validate is not None:
+
+            def evaluate(step: int, state: TrainState, metrics: Metrics) -> None:
+                try:
+                    scores = validate(state.eval_variables, should_stop)
+                except devices.Stopped:
+                    _log.warning("the evaluation after step %d is skipped", step)
+                    return
+                writer.write(step, scores.values, scores.figures)
+                throughput.restart(step)
+                save(step, state, metrics, best=scores.best)
+
+            epochs = config.train.evaluate_every_epochs
+            called.append(due(epochs * data.steps_per_epoch, evaluate))
+        called.append(due(log_every_steps, check))
+        called.append(due(config.train.checkpoint_every_steps, save))
+        if profile:
+            trace = hooks.Trace(profile, start, num_steps, config.logging.profile_steps)
+            called.append(stack.enter_context(trace))
+
+        state = loop.train(
+            state,
+            step,
+            throughput,
+            called,
+            num_steps=num_steps,
+            should_stop=should_stop,
+        )
+        last = int(state.step)
+        is_finished = last >= num_steps and not should_stop()
+        save(last, state, {})
+        checkpoints.wait()
+    return state, is_finished
+
+
+def _make_state_and_step(
+    config: Config,
+    model: nn.Module,
+    data: TrainingData,
+    mesh: Mesh,
+    checkpoints: Checkpoints,
+    initial: Callable[[Batch], Variables],
+) -> tuple[TrainState, loop.PlacedStep]:
+    """Restores or initializes the state, and returns it with the function of a step."""
+    train = config.train
+    use_ema = train.ema_decay is not None
+    is_frozen = getattr(model, "is_frozen", None)
+    optimizer = make_optimizer(train, make_schedule(train, data.steps_per_epoch))
+
+    def create(variables: Variables) -> TrainState:
+        return create_state(variables, optimizer, use_ema=use_ema, is_frozen=is_frozen)
+
+    def place(state: TrainState) -> Any:
+        return devices.state_sharding(state, mesh, train.parameter_sharding)
+
+    state = loop.restore_or_initialize(
+        checkpoints,
+        data.batches,
+        functools.partial(initial, loop.empty_batch(data.batches)),
+        create,
+        place,
+        data.info.get("same", {}),
+    )
+    step = make_train_step(
+        model,
+        optimizer,
+        data.grid,
+        loss=config.loss,
+        decoding=config.decode,
+        ema_decay=train.ema_decay,
+    )
+    return state, loop.place_step(step, state, mesh, config.seed)
 
 
 # Workdir -----------------------------------------------------------------------------
@@ -163,7 +369,7 @@ def claimed(workdir: pathlib.Path, config: Config) -> Iterator[None]:
             if not any(workdir.glob("checkpoints/*")):
                 files.write_json(path, content)
 
-        distributed.main_only(take)
+        devices.main_only(take)
         what = "a run with another config"
         fix = "give another --workdir, or remove that one"
         files.claim(path, content, what, fix=fix, name="config", ignore=("logging",))
@@ -255,7 +461,8 @@ def run_seeds(
         UserError: Two seeds are equal, or `run` raises it.
     """
     require(len(set(seeds)) == len(seeds), "--seeds", seeds, "different seeds")
-    workdir, tables = files.as_path(workdir).absolute(), {}
+    workdir = files.as_path(workdir).absolute()
+    tables = {}
     for seed in seeds:
         _log.info("seed %d of %s", seed, list(seeds))
         folder = run(config.replace(seed=seed), workdir / f"seed{seed}", **options)
@@ -268,7 +475,7 @@ def run_seeds(
             for row in csv.DictReader(files.read_text(metrics).splitlines())
             if float(row["num_gt"])
         }
-    if tables and distributed.is_main():
+    if tables and devices.is_main():
         _write_summary(workdir, tables)
     return workdir
 
@@ -285,7 +492,8 @@ def _write_summary(
         workdir: Folder of `seeds.json`, `seeds.txt`, `seeds.md` and `seeds.tex`.
         tables: APs by seed and by the values of `_KEYS`.
     """
-    rows, lines = list[dict[str, Any]](), []
+    rows = list[dict[str, Any]]()
+    lines = []
     first, *others = tables.values()
     for key in (key for key in first if all(key in table for table in others)):
         values = {seed: table[key] for seed, table in tables.items()}

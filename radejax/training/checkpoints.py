@@ -21,20 +21,15 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
-from absl import logging as absl_logging
 from jax.experimental import multihost_utils
 from orbax.checkpoint import checkpoint_managers as policies
 
-from radejax.core import files
+from radejax.core import devices, files
 from radejax.core.errors import DataError, one_line
-from radejax.training import distributed
 
 _log = logging.getLogger(__name__)
 
 T = TypeVar("T")
-
-# Orbax logs what it does and raises its errors too, so that its log is not needed.
-absl_logging.get_absl_logger().addFilter(lambda record: "orbax" not in record.pathname)
 
 _BEST = "best"  # name of the metric that decides which checkpoint is best
 _VARIABLES = ("params", "ema_params", "model_state")
@@ -164,12 +159,12 @@ class Checkpoints:
         Raises:
             DataError: There are checkpoints, but none is intact. They are not moved.
         """
-        steps = distributed.list_of_main(self.steps())
+        steps = devices.list_of_main(self.steps())
         for step in reversed(steps):
             found = self._read_on_all(step, state)
             if found is not None:
                 newer = [other for other in steps if other > step]
-                distributed.main_only(functools.partial(self._move_away, newer))
+                devices.main_only(functools.partial(self._move_away, newer))
                 self._manager.reload()
                 restored, description = found
                 data_iterator.set_state(description["position"])
@@ -320,7 +315,7 @@ def _on_all(work: Callable[[], T]) -> T | None:
         result = work()
     except DataError as error:
         _log.warning("%s", error)
-    return result if distributed.all_agree(result is not None) else None
+    return result if devices.all_agree(result is not None) else None
 
 
 # Checksums ---------------------------------------------------------------------------

@@ -24,6 +24,7 @@ from radejax.losses.detection import LossOptions, detection_loss
 from radejax.training.options import TrainOptions
 
 Metrics = dict[str, Num[jax.Array, ""]]
+Variables = Mapping[str, Any]
 Step = Callable[["TrainState", Batch, jax.Array], tuple["TrainState", Metrics]]
 
 
@@ -55,7 +56,8 @@ def make_schedule(train: TrainOptions, steps_per_epoch: int) -> optax.Schedule:
         UserError: The warm-up is not shorter than the training.
     """
     peak, minimum = train.learning_rate, train.final_learning_rate
-    num_steps, warmup_steps = count_steps(train, steps_per_epoch), train.warmup_steps
+    warmup_steps = train.warmup_steps
+    num_steps = count_steps(train, steps_per_epoch)
     expected = f"less than the {num_steps} steps of the training"
     is_shorter = warmup_steps < num_steps
     require(is_shorter, "config.train.warmup_steps", warmup_steps, expected)
@@ -218,6 +220,33 @@ def with_pretrained(
             )
         merged[path] = new
     return flax.traverse_util.unflatten_dict(merged, sep="/")
+
+
+def run_keys(seed: int | jax.Array) -> jax.Array:
+    """Returns the random keys of a run: of the initial parameters, and of the steps."""
+    return jax.random.split(jax.random.key(seed))
+
+
+def initial_variables(
+    model: nn.Module,
+    seed: int,
+    batch: Batch,
+    variables: Variables | None = None,
+    pretrained: Variables | None = None,
+) -> Variables:
+    """Creates the variables of step 0.
+
+    Args:
+        model: Radar or radar-camera detector.
+        seed: Seed of the run.
+        batch: A batch with the shapes of the model's inputs.
+        variables: Variables to start from; initialized from the seed if None.
+        pretrained: Part of the variables that replaces initialized ones.
+    """
+    if variables is None:
+        init_key, _ = run_keys(seed)
+        variables = model.init(init_key, *batch.model_inputs(), train=False)
+    return variables if pretrained is None else with_pretrained(variables, pretrained)
 
 
 # Step --------------------------------------------------------------------------------

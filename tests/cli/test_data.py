@@ -230,7 +230,7 @@ def test_points_of_two_disks(
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("one_device")
+@pytest.mark.usefixtures("commands_on_one_device")
 @pytest.mark.parametrize("doppler_bins", [4, 0])
 def test_a_run_is_trained_evaluated_and_detects(
     disks: Any, tmp_path: pathlib.Path, doppler_bins: int

@@ -2,8 +2,6 @@
 
 import json
 import pathlib
-import subprocess
-import sys
 from types import SimpleNamespace
 
 import click.testing
@@ -241,16 +239,3 @@ def test_a_part_of_the_data_is_chosen(
     assert seen == 3 * [((1, 58), ("fog", "rain"))]
     _run("data", "check", tmp_path)
     assert seen[-1] == (None, None)
-
-
-def test_a_program_does_not_replace_the_process_that_runs_it() -> None:
-    script = pathlib.Path(__file__).resolve().parents[2] / "train.py"
-    code = (
-        "import runpy, sys; print('started'); sys.argv = ['train.py', '--help']; "
-        f"runpy.run_path({str(script)!r}, run_name='__main__')"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    )
-    assert done.stdout.count("started") == 1
-    assert "--config" in done.stdout

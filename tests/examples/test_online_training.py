@@ -15,7 +15,6 @@ from radejax.core.errors import UserError
 from radejax.runs.evaluate import evaluate_run
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
-from radejax.training import distributed
 from radejax.training.checkpoints import Checkpoints
 
 from .. import small_models as small
@@ -46,9 +45,8 @@ def _config():
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("commands_on_one_device")
 def test_training_resumes_with_identical_results(tmp_path, monkeypatch):
-    mesh = distributed.make_mesh(1)
-    monkeypatch.setattr(distributed, "make_mesh", lambda *_: mesh)
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     result = train_online(_config(), whole, num_sequences=2)
     assert result.step == 4  # 4 frames per epoch

@@ -93,7 +93,7 @@ def test_the_config_fits_the_radar() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("one_device")
+@pytest.mark.usefixtures("commands_on_one_device")
 def test_a_simulated_recording_is_trained_evaluated_and_drawn(
     tmp_path: pathlib.Path,
 ) -> None:

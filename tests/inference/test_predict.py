@@ -1,13 +1,13 @@
 """Predictions and scores of a dataset: the same on one device and on eight."""
 
 from types import SimpleNamespace
-from unittest import mock
 
 import numpy as np
 import pytest
 
 from radejax import models
 from radejax.config import Config
+from radejax.core import devices
 from radejax.data.options import DataOptions
 from radejax.data.records import preprocess
 from radejax.inference.detector import Detector
@@ -18,7 +18,6 @@ from radejax.runs.data import Data
 from radejax.runs.evaluate import Evaluation
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
-from radejax.training import distributed
 
 from ..small_models import drawn
 
@@ -64,9 +63,8 @@ def setup(tmp_path_factory):
 
 
 def _predict(setup, num_devices):
-    mesh = distributed.make_mesh(num_devices)
-    with mock.patch.object(distributed, "make_mesh", return_value=mesh):
-        evaluation = Evaluation(setup.config, setup.data)
+    mesh = devices.make_mesh(num_devices)
+    evaluation = Evaluation(setup.config, setup.data, mesh=mesh)
     return evaluation.predict(setup.variables, progress=False)
 
 
@@ -110,7 +108,7 @@ def test_a_prediction_stops_when_asked(setup):
         asked.append(True)
         return True
 
-    with pytest.raises(distributed.Stopped):
+    with pytest.raises(devices.Stopped):
         Evaluation(setup.config, setup.data).validate(setup.variables, should_stop)
     assert asked == [True]
 
@@ -124,7 +122,6 @@ def test_scores_during_training_name_their_protocol(setup):
     means = [v for k, v in scores.values.items() if k.startswith(name)]
     assert means == [scores.best]
     assert len(scores.figures) == 1
-    mesh = distributed.make_mesh(1)
-    with mock.patch.object(distributed, "make_mesh", return_value=mesh):
-        alone = Evaluation(setup.config, setup.data).validate(setup.variables)
+    mesh = devices.make_mesh(1)
+    alone = Evaluation(setup.config, setup.data, mesh=mesh).validate(setup.variables)
     assert alone.values == pytest.approx(scores.values)

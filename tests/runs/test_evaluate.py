@@ -171,31 +171,3 @@ def test_other_options_have_another_folder(
         changes = {**changes, "out": tmp_path / changes["out"]}
     evaluate.evaluate_run(tmp_path, **changes)
     assert written == [tmp_path / folder]
-
-
-@pytest.mark.parametrize("is_simulated", [True, False])
-def test_titles_of_scenes_say_whether_they_are_simulated(
-    is_simulated: bool, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Frames(list[Any]):
-        pass
-
-    frames = Frames([SimpleNamespace(key="1/00033_00001", weather="fog", boxes=[])])
-    frames.is_simulated = is_simulated
-    titles: list[str] = []
-    monkeypatch.setattr(evaluate, "draw_scenes", titles.extend)
-    saved: list[str] = []
-    monkeypatch.setattr(
-        evaluate, "save_figure", lambda _, path: saved.append(path.name)
-    )
-    evaluation: Any = SimpleNamespace(
-        _frames=frames,
-        _options=SimpleNamespace(num_visualizations=1, figures="pdf"),
-        _spread=lambda count: [0] * count,
-        _figures=lambda _, indices: [(f"frame_{index}", None) for index in indices],
-        _scene=lambda _, __, title: title,
-    )
-    evaluate.Evaluation._write_figures(evaluation, {}, tmp_path, tmp_path, [7])
-    assert saved == ["frame_0.pdf", "frame_7.pdf", "scenes.pdf"]
-    assert (tmp_path / "worst_frames").is_dir()  # also without mistakes
-    assert titles == [f"fog (1/00033_00001){', simulated' if is_simulated else ''}"]

@@ -7,8 +7,10 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from jax.sharding import Mesh
 
 from radejax.config import Config, load_config
+from radejax.core import devices
 from radejax.core.errors import UserError
 from radejax.data.kradar import dataset
 from radejax.inference.detect_files import detect_files, find_inputs
@@ -18,7 +20,6 @@ from radejax.runs import evaluate, experiment
 from radejax.runs.experiment import claimed
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
-from radejax.training import distributed, loop
 from radejax.training.checkpoints import Checkpoints
 
 from .. import small_models as small
@@ -35,16 +36,16 @@ def _small_run(folder: pathlib.Path, **simulation: Any) -> Config:
     )
 
 
-@pytest.mark.usefixtures("one_device")
 def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
     tmp_path: pathlib.Path,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
+    one_device: Mesh,
 ) -> None:
     caplog.set_level("INFO", logger="radejax")
     said_before = []
 
-    def train(*args: Any, **__: Any) -> Any:
+    def fit(*args: Any, **__: Any) -> Any:
         said_before.append(caplog.text)
         return SimpleNamespace(step=1), True
 
@@ -57,8 +58,8 @@ def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
         train={"batch_size": 2},
         data={"roots": (str(root),)},
     )
-    monkeypatch.setattr(loop, "train", train)
-    experiment.run(config, tmp_path / "run")
+    monkeypatch.setattr(experiment, "fit", fit)
+    experiment.run(config, tmp_path / "run", mesh=one_device)
     assert f"no frames of the test split in {root}" in said_before[0]
     assert not (tmp_path / "run" / "evaluation").exists()
     assert "radejax detect" in caplog.text
@@ -80,11 +81,11 @@ def test_frames_and_frozen_weights_tell_whether_a_run_is_the_same() -> None:
     assert stays(["1/a"], "0" * 64) != stays(["1/a"], "1" * 64)
 
 
-@pytest.mark.usefixtures("one_device")
 def test_labels_are_read_once(
     tmp_path: pathlib.Path,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
+    one_device: Mesh,
 ) -> None:
     """And the sequences that are held out choose the best checkpoint."""
     parsed: collections.Counter = collections.Counter()
@@ -106,7 +107,7 @@ def test_labels_are_read_once(
         lambda f, split: evaluated.append([x.sequence for x in f]) or make(f, split),
     )
     with caplog.at_level("INFO", "radejax"):
-        folder = experiment.run(config, tmp_path / "run")
+        folder = experiment.run(config, tmp_path / "run", mesh=one_device)
     assert evaluated == [[2, 2], [4, 4]]
     (events,) = (folder / "tensorboard").glob("*.test")
     assert b"test/map_3d_iou30/coco101/" in events.read_bytes()
@@ -120,16 +121,15 @@ def test_labels_are_read_once(
     assert set(parsed.values()) == {1}
 
 
-@pytest.mark.usefixtures("one_device")
 def test_a_run_of_two_frames(
-    tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture
+    tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture, one_device: Mesh
 ) -> None:
     """Training, evaluation and detection; weights fit models of two frames only."""
     config = _small_run(tmp_path, train_sequences=2, frames_per_sequence=3).replace(
         data={"num_frames": 2}, model={"input_stem": True}
     )
     with caplog.at_level("INFO", "radejax"):
-        folder = experiment.run(config, tmp_path / "run")
+        folder = experiment.run(config, tmp_path / "run", mesh=one_device)
     assert "2 of 6 samples of 2 frames repeat one" in caplog.text
     assert "1 of 3 samples of 2 frames repeat one" in caplog.text
     saved = load_model(folder)
@@ -142,13 +142,13 @@ def test_a_run_of_two_frames(
     assert (count["frames"], count["repeated"]) == (9, 3)
     one = config.replace(data={"num_frames": 1})
     with pytest.raises(UserError, match=r"run do not fit config.model .*stem/doppler"):
-        experiment.run(one, tmp_path / "one", init_from=folder)
+        experiment.run(one, tmp_path / "one", init_from=folder, mesh=one_device)
     single = config.replace(
         data={"roots": (str(tmp_path / "single"),)},
         simulation={"train_sequences": 4, "frames_per_sequence": 1},
     )
     with pytest.raises(UserError, match=r"num_frames is 2, expected 1, as no frame to"):
-        experiment.run(single, tmp_path / "single_run")
+        experiment.run(single, tmp_path / "single_run", mesh=one_device)
 
 
 def test_nothing_is_written_for_paths_that_do_not_exist(tmp_path: pathlib.Path) -> None:
@@ -164,15 +164,13 @@ def test_nothing_is_written_for_paths_that_do_not_exist(tmp_path: pathlib.Path) 
 
 
 def test_a_batch_that_does_not_divide_is_rejected_first(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: pathlib.Path,
 ) -> None:
-    mesh = distributed.make_mesh(4)
-    monkeypatch.setattr(distributed, "make_mesh", lambda *_: mesh)
     config = load_config("quickstart").replace(train={"batch_size": 2})
     with pytest.raises(
         UserError, match=r"batch_size is 2, expected a multiple of 4 devices"
     ):
-        experiment.run(config, tmp_path / "run")
+        experiment.run(config, tmp_path / "run", mesh=devices.make_mesh(4))
     assert not list(tmp_path.iterdir())
 
 

@@ -11,10 +11,12 @@ import pytest
 
 from radejax import models
 from radejax.config import Config
+from radejax.core import devices
 from radejax.core.structures import Batch
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.detection import LossOptions
 from radejax.models.options import RadeNetOptions
+from radejax.runs.experiment import TrainingData, fit
 from radejax.training.options import TrainOptions
 
 from ..small_models import drawn
@@ -39,6 +41,31 @@ class Tiny:
         dataset = dataset.repeat(None).batch(batch_size)
         dataset = dataset.map(lambda i: jax.tree.map(lambda x: x[i], self.frames))
         return iter(dataset.to_iter_dataset(grain.ReadOptions(num_threads=0)))
+
+    def fit(
+        self,
+        workdir: pathlib.Path,
+        batches: Any = None,
+        *,
+        steps_per_epoch: int = NUM_FRAMES // 4,
+        info: Any = None,
+        num_devices: int = 1,
+        **changes: Any,
+    ) -> Any:
+        """Result of `experiment.fit` on the tiny data, on one device by default."""
+        data = TrainingData(
+            batches=self.loader() if batches is None else batches,
+            steps_per_epoch=steps_per_epoch,
+            grid=self.map_grid,
+            info=info or {},
+        )
+        arguments = {
+            "config": self.config,
+            "model": self.model,
+            "initial": lambda _: self.variables,
+        }
+        mesh = devices.make_mesh(num_devices)
+        return fit(data=data, workdir=workdir, mesh=mesh, **(arguments | changes))
 
 
 @pytest.fixture(scope="session")

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from radejax.core import devices
 from radejax.core.errors import DataError, DiskFullError
-from radejax.training import distributed
 from radejax.training.checkpoints import Checkpoints, array_checksums
 
 from .. import processes
@@ -52,7 +52,7 @@ def _state(step: int) -> dict[str, Any]:
 
 
 def _abstract(state: Any = None) -> Any:
-    whole = distributed.replicated(distributed.make_mesh(1))
+    whole = devices.replicated(devices.make_mesh(1))
     state = _state(0) if state is None else state
     return jax.tree.map(
         lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=whole), state
@@ -257,7 +257,7 @@ def test_whole_files_with_other_weights_are_found(folder: pathlib.Path) -> None:
 
 
 def test_the_checksum_does_not_depend_on_the_placement() -> None:
-    mesh = distributed.make_mesh()
+    mesh = devices.make_mesh()
     split = jax.sharding.NamedSharding(
         mesh, jax.sharding.PartitionSpec(mesh.axis_names[0])
     )
@@ -322,7 +322,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 from radejax.training.checkpoints import Checkpoints
 
-mesh = distributed.make_mesh()
+mesh = devices.make_mesh()
 iterator = iter(grain.MapDataset.range(1000).repeat(None).to_iter_dataset())
 state = {
     name: jax.ShapeDtypeStruct((16, 4), np.float32, sharding=NamedSharding(mesh, spec))

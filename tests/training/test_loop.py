@@ -18,12 +18,14 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from radejax.core import devices
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import DetectionMaps
-from radejax.training import distributed, loop
+from radejax.geometry.radar_grid import RadarGrid
+from radejax.runs import experiment
+from radejax.training import loop
 from radejax.training.checkpoints import Checkpoints
-from radejax.training.metric_logger import Scores
-from radejax.training.options import TrainOptions
+from radejax.training.metric_writer import Scores
 from radejax.training.step import make_schedule
 
 Tiny = Any  # the fixture `tiny` of conftest.py
@@ -32,65 +34,30 @@ STEPS_PER_EPOCH = 4
 
 @pytest.fixture(scope="module", autouse=True)
 def compiled_once() -> Iterator[None]:
-    """Equal options share their optimizer and step, which JAX then traces once.
-
-    Runs differ in what happens around their steps, and tracing takes the longest.
-    """
-    fields = ("learning_rate", "final_learning_rate", "warmup_steps", "num_epochs")
-    fields = (*fields, "max_steps", "weight_decay", "gradient_clip_norm")
-    fields = (*fields, "gradient_accumulation_steps")
+    """Steps of equal options are the same function, which JAX traces once."""
 
     def key(x: Any) -> Any:
-        if isinstance(x, TrainOptions):
-            assert x.schedule == "cosine"  # does not count epochs
-            return tuple(getattr(x, name) for name in fields)
-        return x if isinstance(x, int) else id(x)
+        return id(x) if isinstance(x, nn.Module | RadarGrid) else repr(x)
 
     def cached(make: Any) -> Any:
-        found = {}
+        found: dict[Any, Any] = {}
 
         def call(*parts: Any, **options: Any) -> Any:
-            made = make(*parts, **options)
-            return found.setdefault((*map(key, parts), repr(options)), made)
+            name = (*map(key, parts), repr(options))
+            return found.setdefault(name, (make(*parts, **options), parts))[0]
 
         return call
 
     with pytest.MonkeyPatch.context() as patch:
         for name in ("make_schedule", "make_optimizer", "make_train_step"):
-            patch.setattr(loop, name, cached(getattr(loop, name)))
+            patch.setattr(experiment, name, cached(getattr(experiment, name)))
         yield
 
 
 @pytest.fixture(scope="module")
 def run(tiny: Tiny) -> Any:
-    """`train` on the tiny data, on one device by default."""
-
-    def train(
-        workdir: pathlib.Path,
-        loader: Any = None,
-        config: Any = None,
-        num_devices: int = 1,
-        model: Any = None,
-        **others: Any,
-    ) -> Any:
-        options = {
-            "info": {},
-            "steps_per_epoch": STEPS_PER_EPOCH,
-            "variables": tiny.variables,
-        }
-        mesh = distributed.make_mesh(num_devices)
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(distributed, "make_mesh", lambda: mesh)
-            return loop.train(
-                tiny.config if config is None else config,
-                tiny.model if model is None else model,
-                tiny.loader() if loader is None else loader,
-                tiny.map_grid,
-                workdir,
-                **(options | others),
-            )
-
-    return train
+    """`fit` on the tiny data."""
+    return tiny.fit
 
 
 @pytest.fixture(scope="module")
@@ -149,7 +116,7 @@ def test_a_run_ends_after_the_given_steps(
     changes = {"max_steps": max_steps, "evaluate_every_epochs": 1}
     config = tiny.config.replace(train=changes)
     evaluate = mock.Mock(return_value=Scores({}, best=1.0))
-    state, is_finished = run(tmp_path, config=config, evaluate=evaluate)
+    state, is_finished = run(tmp_path, config=config, validate=evaluate)
     assert is_finished
     assert state.step == expected
     assert evaluate.call_count == 2  # after the first epoch and at the end
@@ -165,7 +132,7 @@ def test_a_seed_initializes_the_variables(
     def initial(name: str, seed: int) -> Any:
         rates = {"learning_rate": 1e-30, "final_learning_rate": 0.0}
         config = tiny.config.replace(seed=seed, train={"num_epochs": 1} | rates)
-        options = {"steps_per_epoch": 1, "variables": None, "config": config}
+        options = {"steps_per_epoch": 1, "initial": None, "config": config}
         return run(tmp_path / name, **options)[0].params
 
     first = initial("a", 0)
@@ -209,11 +176,11 @@ def test_sigterm_in_an_evaluation_saves_and_stops(
         assert not should_stop()
         os.kill(os.getpid(), signal.SIGTERM)
         if should_stop():
-            raise distributed.Stopped
+            raise devices.Stopped
         raise AssertionError("the signal was not seen")
 
     def start() -> Any:
-        return run(workdir, config=config, evaluate=evaluate)
+        return run(workdir, config=config, validate=evaluate)
 
     for step in (4, 8):  # the second time in the evaluation at the end
         state, is_finished = start()
@@ -280,9 +247,7 @@ def test_a_state_comes_back_bit_for_bit_on_another_number_of_devices(
     state = undisturbed[0][0]
 
     def placed(count: int) -> Any:
-        return distributed.state_sharding(
-            state, distributed.make_mesh(count), "fsdp", 64
-        )
+        return devices.state_sharding(state, devices.make_mesh(count), "fsdp", 64)
 
     saved = jax.device_put(state, placed(first))
     assert first == 1 or any(
@@ -355,7 +320,7 @@ def test_evaluation_on_the_way_is_logged_and_the_best_kept(
         best = next(values)
         return Scores({"validation/ap_bev_iou30/exact": best}, best, {"a": Figure()})
 
-    run(workdir, config=config, evaluate=evaluate, steps_per_epoch=2)
+    run(workdir, config=config, validate=evaluate, steps_per_epoch=2)
     rows = map(json.loads, (workdir / "metrics.jsonl").read_text().splitlines())
     rows = list(rows)
     name = "validation/ap_bev_iou30/exact"
@@ -404,8 +369,8 @@ def test_debugging_works_in_a_run(
     try:
         if setting == "jax_debug_nans":
             with pytest.raises(FloatingPointError, match=r"\(nan\) encountered in log"):
-                run(workdir, config=config, model=model, variables=variables)
+                run(workdir, config=config, model=model, initial=lambda _: variables)
         else:
-            run(workdir, config=config, model=model, variables=variables)
+            run(workdir, config=config, model=model, initial=lambda _: variables)
     finally:
         jax.config.update(setting, False)

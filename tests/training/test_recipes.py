@@ -18,7 +18,6 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.saved import starting_weights
 from radejax.losses.detection import LossOptions, detection_loss
 from radejax.models.options import DinoRadeOptions
-from radejax.training import loop
 from radejax.training.step import (
     create_state,
     make_optimizer,
@@ -199,7 +198,6 @@ def _batch(config: Config, grid: RadarGrid) -> Batch:
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("one_device")
 def test_fine_tuning_starts_from_an_official_checkpoint(
     tiny: Any, workdir: pathlib.Path
 ) -> None:
@@ -211,15 +209,8 @@ def test_fine_tuning_starts_from_an_official_checkpoint(
     path = workdir / "best.safetensors"
     safetensors.numpy.save_file(radenet_torch.save(tiny.model, official), path)
     variables, *_ = starting_weights(config.model, path)
-    state, _ = loop.train(
-        config,
-        tiny.model,
-        tiny.loader(),
-        tiny.map_grid,
-        workdir,
-        info={},
-        steps_per_epoch=2,
-        variables=variables,
+    state, _ = tiny.fit(
+        workdir, config=config, steps_per_epoch=2, initial=lambda _: variables
     )
     assert state.step == 2
     chex.assert_trees_all_close(state.params, official["params"], atol=1e-7)

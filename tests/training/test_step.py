@@ -9,11 +9,11 @@ import numpy as np
 import optax
 import pytest
 
+from radejax.core import devices
 from radejax.core.structures import to_float
 from radejax.detection.decode import DecodeOptions, decode
 from radejax.geometry.boxes import boxes7_from_8
 from radejax.geometry.rotated_iou import bev_iou
-from radejax.training import distributed
 from radejax.training.step import (
     create_state,
     make_optimizer,
@@ -134,15 +134,15 @@ def plain(tiny: Tiny, start: Any) -> tuple[Any, Any, Any]:
 def test_eight_devices_equal_one(tiny: Tiny, plain: Any, parameters: str) -> None:
     optimizer, state, step = plain
     expected, expected_metrics = step(state, _batch(tiny, 8), RNG)
-    mesh = distributed.make_mesh(8)
-    placement = distributed.state_sharding(state, mesh, parameters, min_size=64)
+    mesh = devices.make_mesh(8)
+    placement = devices.state_sharding(state, mesh, parameters, min_size=64)
     if parameters == "fsdp":
         assert any(not s.is_fully_replicated for s in jax.tree.leaves(placement.params))
     sharded = jax.jit(
-        _make(tiny, optimizer), out_shardings=(placement, distributed.replicated(mesh))
+        _make(tiny, optimizer), out_shardings=(placement, devices.replicated(mesh))
     )
-    on_mesh = jax.device_put((state, RNG), (placement, distributed.replicated(mesh)))
-    batch = distributed.put_batch(_batch(tiny, 8), mesh)
+    on_mesh = jax.device_put((state, RNG), (placement, devices.replicated(mesh)))
+    batch = devices.put_batch(_batch(tiny, 8), mesh)
     program = sharded.lower(on_mesh[0], batch, on_mesh[1]).compile()
     with jax.transfer_guard("disallow"):
         actual, metrics = program(on_mesh[0], batch, on_mesh[1])

@@ -18,13 +18,13 @@ import pytest
 
 from radejax import models
 from radejax.config import Config, load_config, load_module
+from radejax.core import devices
 from radejax.core.structures import CLASSES, Batch, DetectionMaps
 from radejax.geometry.camera import CameraCalibration, stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.saved import load_torch
 from radejax.models.lifting import OFFICIAL_OFFSET_M
 from radejax.models.vit import ViT
-from radejax.training import distributed
 from radejax.training.step import (
     TrainState,
     create_state,
@@ -71,14 +71,14 @@ def train(
     schedule = make_schedule(options, STEPS_PER_EPOCH)
     optimizer = make_optimizer(options, schedule)
     grid = models.map_grid(RadarGrid.kradar(), model, config.data.azimuth_mapping)
-    mesh = distributed.make_mesh(1)
+    mesh = devices.make_mesh(1)
     state = create_state(
         variables,
         optimizer,
         use_ema=False,
         is_frozen=getattr(model, "is_frozen", None),
     )
-    placement = distributed.state_sharding(state, mesh, "replicated")
+    placement = devices.state_sharding(state, mesh, "replicated")
     state = jax.device_put(state, placement)
     step = make_train_step(
         model, optimizer, grid, loss=config.loss, decoding=config.decode
@@ -88,7 +88,7 @@ def train(
     for i in range(num_steps):
         first = 2 * (i % STEPS_PER_EPOCH)
         part = jax.tree.map(lambda x, a=first: x[a : a + 2], batch)
-        state, metrics = step(state, distributed.put_batch(part, mesh), rng)
+        state, metrics = step(state, devices.put_batch(part, mesh), rng)
         rate = schedule(np.int32(i))
         measured.append({"lr": rate} | {name: metrics[name] for name in LOSSES})
     return state, {

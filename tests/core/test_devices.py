@@ -3,6 +3,7 @@
 import os
 import signal
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import chex
@@ -12,8 +13,8 @@ import numpy as np
 import pytest
 from jax.sharding import PartitionSpec
 
+from radejax.core import devices
 from radejax.core.errors import UserError
-from radejax.training import distributed
 
 from .. import processes
 
@@ -33,9 +34,9 @@ def two(monkeypatch: pytest.MonkeyPatch) -> Any:
 
         monkeypatch.setattr(jax, "process_count", lambda: 2)
         monkeypatch.setattr(jax, "process_index", lambda: index)
-        multihost = distributed.ocp.multihost
-        monkeypatch.setattr(multihost, "sync_global_processes", wait)
-        monkeypatch.setattr(distributed.multihost_utils, "process_allgather", gather)
+        client = SimpleNamespace(wait_at_barrier=wait)
+        monkeypatch.setattr(devices.jax_distributed.global_state, "client", client)
+        monkeypatch.setattr(devices.multihost_utils, "process_allgather", gather)
         return events
 
     return become
@@ -43,11 +44,11 @@ def two(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 def test_the_others_wait_while_the_main_process_works(two: Any) -> None:
     events = two(0)
-    assert distributed.main_only(lambda: events.append("work") or 5) == 5
+    assert devices.main_only(lambda: events.append("work") or 5) == 5
     assert events == ["work", "wait", "gather"]
     events.clear()
     two(1)
-    assert distributed.main_only(lambda: events.append("work")) is None
+    assert devices.main_only(lambda: events.append("work")) is None
     assert events == ["wait", "gather"]
 
 
@@ -57,24 +58,24 @@ def test_an_error_of_the_main_process_reaches_the_others(two: Any) -> None:
 
     events = two(0)
     with pytest.raises(OSError, match="broken"):
-        distributed.main_only(fail)
+        devices.main_only(fail)
     assert events == ["wait", "gather"]
     two(1, main_is_fine=False)
     with pytest.raises(UserError, match="process 0 stopped with an error"):
-        distributed.main_only(fail)
+        devices.main_only(fail)
 
 
 # Two processes ask each other until one of them is killed or fails.
 TALK = (
     processes.JOIN
     + """
-with distributed.end_with_others():
+with devices.end_with_others():
     print("ready", flush=True)
-    while distributed.all_agree(sys.argv[1] == "nobody fails"):
+    while devices.all_agree(sys.argv[1] == "nobody fails"):
         pass
     if index == 1:
         raise OSError("a defect")
-    distributed.all_agree(True)
+    devices.all_agree(True)
 """
 )
 
@@ -104,8 +105,8 @@ def test_a_process_that_fails_ends_the_other() -> None:
 
 @pytest.fixture
 def stop() -> Iterator[Any]:
-    mesh = distributed.make_mesh(1)
-    with distributed.stop_on_signal(mesh) as should_stop:
+    mesh = devices.make_mesh(1)
+    with devices.stop_on_signal(mesh) as should_stop:
         yield should_stop
 
 
@@ -130,7 +131,7 @@ def test_the_second_signal_of_a_closed_terminal_is_ignored_and_that_of_a_user_is
 def test_under_nohup_a_closed_terminal_is_ignored() -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        with distributed.stop_on_signal(distributed.make_mesh(1)) as should_stop:
+        with devices.stop_on_signal(devices.make_mesh(1)) as should_stop:
             os.kill(os.getpid(), signal.SIGHUP)
             assert not should_stop()
         assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
@@ -139,22 +140,22 @@ def test_under_nohup_a_closed_terminal_is_ignored() -> None:
 
 
 def test_put_batch_splits_the_leading_axis() -> None:
-    mesh = distributed.make_mesh(4)
+    mesh = devices.make_mesh(4)
     batch = {"x": np.arange(24.0).reshape(8, 3), "i": np.arange(8)}
-    placed = distributed.put_batch(batch, mesh)
+    placed = devices.put_batch(batch, mesh)
     chex.assert_trees_all_equal(placed, batch)
     assert [s.data.shape for s in placed["x"].addressable_shards] == [(2, 3)] * 4
 
 
 def test_fsdp_splits_the_widest_axis_that_divides() -> None:
-    mesh = distributed.make_mesh(4)
+    mesh = devices.make_mesh(4)
     state = {
         "kernel": jax.ShapeDtypeStruct((3, 3, 128, 256), jnp.float32),
         "bias": jax.ShapeDtypeStruct((256,), jnp.float32),
         "odd": jax.ShapeDtypeStruct((333, 333), jnp.float32),
     }
-    placed = distributed.state_sharding(state, mesh, "fsdp")
+    placed = devices.state_sharding(state, mesh, "fsdp")
     assert placed["kernel"].spec == PartitionSpec(None, None, None, "data")
     assert placed["bias"].spec == placed["odd"].spec == PartitionSpec()
-    whole = distributed.state_sharding(state, mesh, "replicated")
+    whole = devices.state_sharding(state, mesh, "replicated")
     assert {s.spec for s in whole.values()} == {PartitionSpec()}

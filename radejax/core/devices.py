@@ -1,6 +1,6 @@
-"""Training on several devices and processes: mesh, placement, main process and signals.
+"""Devices and processes: mesh, placement of arrays, main process and signals.
 
-Training is data parallel: every device holds all parameters and a slice of the batch.
+Computations are data parallel: every device holds all parameters and a slice of the batch.
 With `fsdp`, the large parameters and their optimizer state are also split over the same
 devices, and XLA gathers them where a layer needs them.
 """
@@ -21,7 +21,6 @@ from typing import Any, Literal, TypeVar
 
 import jax
 import numpy as np
-import orbax.checkpoint as ocp
 from jax._src import distributed as jax_distributed
 from jax.experimental import multihost_utils
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
@@ -68,10 +67,11 @@ def batch_sharding(mesh: Mesh) -> NamedSharding:
     return NamedSharding(mesh, PartitionSpec(DATA_AXIS))
 
 
-def check_batch_size(batch_size: int) -> None:
+def check_batch_size(batch_size: int, mesh: Mesh) -> None:
     """Raises `UserError` if the batch size is not a multiple of the number of devices."""
-    count, name = make_mesh().size, "config.train.batch_size"
-    require(batch_size % count == 0, name, batch_size, f"a multiple of {count} devices")
+    expected = f"a multiple of {mesh.size} devices"
+    is_multiple = batch_size % mesh.size == 0
+    require(is_multiple, "config.train.batch_size", batch_size, expected)
 
 
 def put_batch(
@@ -144,11 +144,10 @@ def main_only(work: Callable[[], T]) -> T | None:
         result = work() if is_main() else None
     except Exception as failed:
         error = failed
-    # With an explicit list of processes, they wait at the coordinator and not in a
-    # collective, which would time out after minutes.
-    name = f"radejax {next(_numbers)}"
-    processes = set(range(jax.process_count()))
-    ocp.multihost.sync_global_processes(name, timeout=_WAIT_S, processes=processes)
+    # They wait at the coordinator and not in a collective, which would time out after
+    # minutes.
+    client: Any = jax_distributed.global_state.client
+    client.wait_at_barrier(f"radejax {next(_numbers)}", timeout_in_ms=1000 * _WAIT_S)
     is_fine = all_agree(error is None)
     if error is not None:
         raise error

@@ -3,9 +3,7 @@
 import errno
 import json
 import pathlib
-import re
 import sys
-import threading
 from unittest import mock
 
 import numpy as np
@@ -13,9 +11,9 @@ import pytest
 from matplotlib.figure import Figure
 
 from radejax.config import Config
+from radejax.core import devices
 from radejax.core.errors import DiskFullError, UserError
-from radejax.training import distributed, metric_logger
-from radejax.training.metric_logger import MetricLogger, Scores, log_results
+from radejax.training.metric_writer import MetricWriter, log_results
 
 
 def _steps(folder: pathlib.Path) -> list[int]:
@@ -23,32 +21,29 @@ def _steps(folder: pathlib.Path) -> list[int]:
     return [json.loads(line)["step"] for line in lines]
 
 
-def _logger(folder: pathlib.Path, start: int, **logging: object) -> MetricLogger:
-    config = Config().replace(logging=logging)
-    return MetricLogger(folder, config, start_step=start, num_steps=10)
+def _writer(folder: pathlib.Path, start: int, **logging: object) -> MetricWriter:
+    return MetricWriter(folder, Config().replace(logging=logging), start)
 
 
 def test_records_after_the_restored_step_are_written_anew(
     tmp_path: pathlib.Path,
 ) -> None:
-    with _logger(tmp_path, 0) as logger:
+    with _writer(tmp_path, 0) as writer:
         for step in (2, 4, 6):
-            logger.log(step, {"focal": float(step)}, epoch=step / 10)
+            writer.write(step, {"focal": float(step)})
     with (tmp_path / "metrics.jsonl").open("a") as file:
         file.write('{"step": 8, "foc')  # killed while writing
-    with _logger(tmp_path, 4) as logger:
+    with _writer(tmp_path, 4) as writer:
         assert _steps(tmp_path) == [2, 4]
-        logger.log(6, {"focal": 60.0}, epoch=0.6)
+        writer.write(6, {"focal": 60.0})
     assert _steps(tmp_path) == [2, 4, 6]
     last = json.loads((tmp_path / "metrics.jsonl").read_text().splitlines()[-1])
-    assert last["focal"] == 60.0
-    assert last["frames_per_s"] > 0
-    assert 0 <= last["data_wait_share"] <= 1
+    assert last == {"step": 6, "focal": 60.0}
 
 
 def test_the_final_results_are_in_tensorboard(tmp_path: pathlib.Path) -> None:
-    with _logger(tmp_path, 0) as logger:
-        logger.log(1, {"focal": 1.0}, epoch=1.0)
+    with _writer(tmp_path, 0) as writer:
+        writer.write(1, {"focal": 1.0})
     log_results(tmp_path, 1, {"map_3d_iou30/coco101": 61.0})
     first, last = sorted((tmp_path / "tensorboard").iterdir(), key=lambda x: x.suffix)[
         ::-1
@@ -62,37 +57,10 @@ def test_the_final_results_are_in_tensorboard(tmp_path: pathlib.Path) -> None:
 def test_other_processes_write_nothing(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(distributed, "is_main", lambda: False)
-    with _logger(tmp_path, 0) as logger:
-        logger.log(1, {"focal": 1.0}, epoch=1.0)
+    monkeypatch.setattr(devices, "is_main", lambda: False)
+    with _writer(tmp_path, 0) as writer:
+        writer.write(1, {"focal": 1.0})
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("num_threads", "text"), [(None, r"\(7 threads"), (3, r"\(3 threads")]
-)
-def test_waiting_for_data_is_warned_of_once(
-    tmp_path: pathlib.Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-    num_threads: int | None,
-    text: str,
-) -> None:
-    monkeypatch.setattr(metric_logger, "usable_cpus", lambda: 7)
-    config = Config().replace(data={"num_threads": num_threads})
-    wait = threading.Event().wait
-    with MetricLogger(tmp_path, config, start_step=0, num_steps=10) as logger:
-        for step, seconds in ((1, 0.0), (2, 0.2), (3, 0.2)):
-            logger.next_batch(map(wait, [seconds]), None)
-            wait(0.1)  # training
-            logger.log(step, {"focal": 1.0}, epoch=0.1)
-            assert len(caplog.records) == min(step - 1, 1)
-    share = json.loads((tmp_path / "metrics.jsonl").read_text().splitlines()[1])
-    warning = f"training waits for data for {100 * share['data_wait_share']:.0f} %"
-    assert caplog.text.count(warning) == 1
-    assert re.search(
-        rf"raise config\.data\.num_threads {text}.* on 7 CPUs", caplog.text
-    )
 
 
 FULL = pathlib.Path("/dev/full")  # every write to it is "no space left"
@@ -101,10 +69,10 @@ needs_full = pytest.mark.skipif(not FULL.exists(), reason="no /dev/full here")
 
 @needs_full
 def test_metrics_on_a_full_disk_are_one_clear_error(tmp_path: pathlib.Path) -> None:
-    with _logger(tmp_path, 0) as logger:
+    with _writer(tmp_path, 0) as writer:
         (tmp_path / "metrics.jsonl").symlink_to(FULL)
         with pytest.raises(DiskFullError, match="no space left"):
-            logger.log(1, {"focal": 1.0}, epoch=1.0)
+            writer.write(1, {"focal": 1.0})
 
 
 class FullDisk:
@@ -124,14 +92,14 @@ class FullDisk:
 def test_tensorboard_on_a_full_disk_is_an_error_and_blocks_nothing(
     tmp_path: pathlib.Path,
 ) -> None:
-    with _logger(tmp_path, 0) as logger:
-        writer = logger._board._get_file_writer().event_writer._ev_writer
-        writer._py_recordio_writer._writer = FullDisk()
+    with _writer(tmp_path, 0) as writer:
+        board = writer._board._get_file_writer().event_writer._ev_writer
+        board._py_recordio_writer._writer = FullDisk()
         values = {f"value{i}": 1.0 for i in range(100)}
 
         def log() -> None:
             for step in range(1000):
-                logger.log(step, values, epoch=1.0)
+                writer.write(step, values)
 
         with pytest.raises(DiskFullError, match="no space left"):
             log()
@@ -143,10 +111,9 @@ def test_weights_and_biases_copies_tensorboard_and_gets_the_config(
     fake = mock.Mock()
     monkeypatch.setitem(sys.modules, "wandb", fake)
     for start in (0, 2):  # the second time, the same run goes on
-        with _logger(tmp_path, start, wandb=True, wandb_project="p") as logger:
-            logger.log(start + 1, {"focal": 2.5}, epoch=0.5)
-            scores = Scores({"ap/exact": 7.0}, 7.0, {"frame": Figure()})
-            logger.log_scores(start + 2, scores)
+        with _writer(tmp_path, start, wandb=True, wandb_project="p") as writer:
+            writer.write(start + 1, {"focal": 2.5})
+            writer.write(start + 2, {"ap/exact": 7.0}, {"frame": Figure()})
     first, second = (call.kwargs for call in fake.init.call_args_list)
     assert first == second
     assert first["sync_tensorboard"]
@@ -160,4 +127,4 @@ def test_weights_and_biases_that_is_not_installed_is_named(
 ) -> None:
     monkeypatch.setitem(sys.modules, "wandb", None)
     with pytest.raises(UserError, match=r"wandb is not installed: pip install"):
-        _logger(tmp_path, 0, wandb=True)
+        _writer(tmp_path, 0, wandb=True)

@@ -1,0 +1,98 @@
+"""Hooks of the training loop, and the loop itself with a step that is not compiled."""
+
+import itertools
+import json
+import pathlib
+import threading
+from types import SimpleNamespace
+from typing import Any
+
+import jax.numpy as jnp
+import pytest
+
+from radejax.config import Config
+from radejax.training import hooks, loop
+from radejax.training.metric_writer import MetricWriter
+
+
+def _step(state: Any, batch: int) -> tuple[Any, Any]:
+    after = SimpleNamespace(step=state.step + 1, seen=[*state.seen, batch])
+    return after, {"loss": jnp.float32(batch)}
+
+
+def test_hooks_are_called_in_order_after_each_step() -> None:
+    calls: list[Any] = []
+
+    def named(name: str) -> hooks.Hook:
+        return lambda step, state, metrics: calls.append((name, step, state.seen[-1]))
+
+    called = [named("a"), hooks.every(5, 2, named("b")), hooks.every(5, 0, named("c"))]
+    state: Any = SimpleNamespace(step=1, seen=[])
+    state = loop.train(state, _step, itertools.count(7), called, num_steps=5)
+    assert (state.step, state.seen) == (5, [7, 8, 9, 10])
+    a, b = ([c[1:] for c in calls if c[0] == name] for name in "ab")
+    assert a == [(2, 7), (3, 8), (4, 9), (5, 10)]
+    assert b == [(2, 7), (4, 9), (5, 10)]
+    assert calls[:2] == [("a", 2, 7), ("b", 2, 7)]
+
+
+def test_the_loop_stops_between_steps() -> None:
+    answers = iter([False, False, True])
+    state: Any = SimpleNamespace(step=0, seen=[])
+    state = loop.train(
+        state,
+        _step,
+        itertools.count(),
+        [],
+        num_steps=9,
+        should_stop=lambda: next(answers),
+    )
+    assert state.seen == [0, 1]
+
+
+@pytest.mark.parametrize(("num_threads", "text"), [(None, "(7 th"), (3, "(3 threads")])
+def test_waiting_for_data_is_warned_of_once(
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    num_threads: int | None,
+    text: str,
+) -> None:
+    monkeypatch.setattr(hooks, "usable_cpus", lambda: 7)
+    config = Config().replace(data={"num_threads": num_threads})
+    wait, state = threading.Event().wait, SimpleNamespace()
+    throughput = hooks.Throughput(map(wait, [0.0, 0.2, 0.2]), 0)
+    bar = hooks.ProgressBar(0, 10)
+    with MetricWriter(tmp_path, config, 0) as writer:
+        log: Any = hooks.Log(config, 10, throughput, writer, bar)
+        for step in (1, 2, 3):
+            next(throughput)
+            wait(0.1)  # training
+            metrics = {"focal": jnp.float32(1)}
+            for hook in (throughput, bar, log):
+                hook(step, state, metrics)
+            assert len(caplog.records) == min(step - 1, 1)
+    first, row, _ = map(
+        json.loads, (tmp_path / "metrics.jsonl").read_text().splitlines()
+    )
+    assert list(first) == ["step", "focal", "learning_rate", "epoch"]
+    assert (row["step"], row["focal"], row["epoch"], bar.n) == (2, 1.0, 0.2, 3)
+    assert row["frames_per_s"] == pytest.approx(10 / 0.3, rel=0.3)
+    assert row["data_wait_share"] == pytest.approx(2 / 3, rel=0.3)
+    warning = f"training waits for data for {100 * row['data_wait_share']:.0f} %"
+    assert caplog.text.count(warning) == 1
+    assert f"raise config.data.num_threads {text}" in caplog.text
+    assert "on 7 CPUs" in caplog.text
+
+
+def test_a_batch_that_is_loaded_while_the_devices_work_costs_no_time() -> None:
+    class Busy:
+        def is_ready(self) -> bool:
+            return False
+
+    wait = threading.Event().wait
+    throughput: Any = hooks.Throughput(map(wait, [0.0, 0.1]), 0)
+    next(throughput)
+    throughput(2, None, {"loss": Busy()})
+    next(throughput)
+    assert throughput.measure(4)[1] < 0.05
