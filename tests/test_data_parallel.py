@@ -19,8 +19,9 @@ import pytest
 from radejax import models
 from radejax.core import devices
 from radejax.core.structures import Batch
+from radejax.detection.decode import DecodeOptions
 from radejax.geometry.camera import stack_cameras
-from radejax.inference.inputs import UNBOUNDED_ROI
+from radejax.inference.inputs import Settings
 from radejax.training.step import create_state, make_train_step
 
 from . import small_models
@@ -174,10 +175,7 @@ def test_devices_share_the_work_of_inference_and_gather_only_detections(
         images = small_models.images(BATCH_SIZE)
         camera = stack_cameras([calibration] * BATCH_SIZE)
     inputs = small_models.projections(BATCH_SIZE), images, camera
-    settings = {"score_threshold": 0.1, "nms_iou": 0.3, "roi": UNBOUNDED_ROI}
-    settings = jax.tree.map(
-        np.float32, settings, is_leaf=lambda x: isinstance(x, tuple)
-    )
+    settings = Settings.of(DecodeOptions(score_threshold=0.1), {})
     programs = []
     for num_devices in (1, 4):
         mesh = devices.make_mesh(num_devices)

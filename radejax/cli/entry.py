@@ -94,13 +94,9 @@ def _message(error: BaseException) -> str:
 def set_up_jax() -> None:
     """Sets up logging at level info and JAX's persistent compilation cache."""
     from absl import flags
-    from absl import logging as absl_logging
 
     log = logging.getLogger("radejax")
     if not log.handlers:
-        # Orbax logs what it does and raises its errors too, so that its log is not needed.
-        absl_log = absl_logging.get_absl_logger()
-        absl_log.addFilter(lambda record: "orbax" not in record.pathname)
         handler = logging.StreamHandler()
         handler.setFormatter(logging.Formatter("%(message)s"))
         log.addHandler(handler)

@@ -91,8 +91,8 @@ def columns_of_boxes(table: AnyBoxes) -> Columns:
         >>> list(columns_of_boxes(box))
         ['frame', 'box', 'cls']
     """
-    columns = vars(table) if isinstance(table, Boxes) else table
-    return {name: np.asarray(x) for name, x in columns.items() if x is not None}
+    columns = table.columns() if isinstance(table, Boxes) else table
+    return {name: np.asarray(x) for name, x in columns.items()}
 
 
 def read_boxes(table: AnyBoxes, name: str, *, scored: bool) -> Boxes:

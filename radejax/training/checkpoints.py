@@ -8,6 +8,7 @@ when it is restored.
 from __future__ import annotations
 
 import concurrent.futures
+import contextlib
 import functools
 import hashlib
 import json
@@ -15,12 +16,13 @@ import logging
 import pathlib
 import shutil
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, TypeVar
 
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
+from absl import logging as absl_logging
 from jax.experimental import multihost_utils
 from orbax.checkpoint import checkpoint_managers as policies
 
@@ -33,6 +35,21 @@ T = TypeVar("T")
 
 _BEST = "best"  # name of the metric that decides which checkpoint is best
 _VARIABLES = ("params", "ema_params", "model_state")
+
+
+@contextlib.contextmanager
+def _without_orbax_log() -> Iterator[None]:
+    """Hides what orbax logs while a block runs, as it raises its errors too."""
+    log = absl_logging.get_absl_logger()
+    log.addFilter(_is_not_of_orbax)
+    try:
+        yield
+    finally:
+        log.removeFilter(_is_not_of_orbax)
+
+
+def _is_not_of_orbax(record: logging.LogRecord) -> bool:
+    return "orbax" not in record.pathname
 
 
 class Checkpoints:
@@ -48,6 +65,7 @@ class Checkpoints:
         DataError: The files that describe the steps are corrupted.
     """
 
+    @_without_orbax_log()
     def __init__(
         self,
         folder: str | pathlib.Path,
@@ -77,6 +95,7 @@ class Checkpoints:
                 f"corrupted ({one_line(error)}); move that checkpoint away"
             ) from None
 
+    @_without_orbax_log()
     def steps(self) -> list[int]:
         """Returns the steps of the finished checkpoints, oldest first."""
         self._manager.reload()
@@ -96,6 +115,7 @@ class Checkpoints:
             )
         return best
 
+    @_without_orbax_log()
     def save(
         self,
         step: int,
@@ -131,6 +151,7 @@ class Checkpoints:
         with files.disk_full(self.folder):
             self._manager.save(step, args=args, metrics=metrics)
 
+    @_without_orbax_log()
     def wait(self) -> None:
         """Waits until all started checkpoints are on disk.
 
@@ -211,6 +232,7 @@ class Checkpoints:
             return None
         return found
 
+    @_without_orbax_log()
     def _read(self, step: int, state: Any = None) -> tuple[Any, dict[str, Any]]:
         """Reads the state and the description of a checkpoint.
 
@@ -294,6 +316,7 @@ class Checkpoints:
     def __enter__(self) -> Checkpoints:
         return self
 
+    @_without_orbax_log()
     def __exit__(self, *_: object) -> None:
         self.wait()
         self._manager.close()

@@ -1,7 +1,5 @@
 """Faces of drawn objects: inside their boxes, sorted, cut at the camera."""
 
-import types
-
 import numpy as np
 import pytest
 
@@ -10,6 +8,7 @@ from radejax.simulation.camera import shapes
 from radejax.simulation.camera.details import DETAILS, Faces
 from radejax.simulation.camera.renderer import stereo_calibration
 from radejax.simulation.config import SimulationOptions
+from radejax.simulation.world.scene import Reflectors, SceneFrame
 
 CALIBRATION = stereo_calibration(SimulationOptions())[0]
 NO_ROADSIDE = Faces(*map(np.zeros, ((0, 4, 3), (0, 3), 0, 0)), np.zeros(0, int))
@@ -27,8 +26,18 @@ def test_blocks_fill_the_box_and_stay_in_it(cls):
 
 def polygons(boxes, classes):
     colors = np.zeros((len(boxes), 2, 3)) + 100.0
-    cls = [CLASSES.index(name) for name in classes]
-    frame = types.SimpleNamespace(boxes=np.array(boxes, float), cls=cls)
+    count = len(boxes)
+    nothing = np.zeros(0, int)
+    frame = SceneFrame(
+        boxes=np.array(boxes, float),
+        velocity_mps=np.zeros((count, 2)),
+        cls=np.array([CLASSES.index(name) for name in classes]),
+        track=np.arange(count),
+        ego_velocity_mps=np.zeros(2),
+        reflectors=Reflectors(np.zeros((0, 3)), np.zeros(0), np.zeros(0), nothing),
+        reflector_idx=nothing,
+        index=0,
+    )
     return shapes.visible_polygons(frame, colors, CALIBRATION, DAY, NO_ROADSIDE)
 
 

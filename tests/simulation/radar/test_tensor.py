@@ -126,6 +126,11 @@ class TestPhysics:
         power = received_power(where, np.ones(2), PARAMETERS)
         assert 10 * np.log10(power[0] / power[1]) == pytest.approx(12.041, abs=1e-3)
 
+    def test_radar_cross_section_is_linear_in_power(self):
+        where = np.array([[30.0, 0.0, 0.0]] * 2)
+        power = received_power(where, np.array([1.0, 100.0]), PARAMETERS)
+        assert power[1] / power[0] == pytest.approx(100.0)
+
     @pytest.mark.parametrize(
         ("phase", "expected"), [(0.0, 4.0), (np.pi / 2, 2.0), (np.pi, 0.0)]
     )
