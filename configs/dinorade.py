@@ -38,7 +38,7 @@ import types
 from typing import Any
 
 from radejax.config import Config, load_module, parse_options
-from radejax.data.cameras import CameraOptions
+from radejax.data.options import CameraOptions
 from radejax.geometry.camera import KRADAR_RADAR_FROM_LIDAR_Z_M
 from radejax.models.lifting import OFFICIAL_OFFSET_M
 from radejax.models.options import DinoRadeOptions, QueryGridOptions, RadeNetOptions

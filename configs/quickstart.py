@@ -88,5 +88,5 @@ def _with_recipe(config: Config) -> Config:
         # with large errors, mostly trucks; the GWD also improves boxes that are nearly
         # right.
         loss={"heatmap_sigma_bins": 0.75, "weights": {"focal": 8.0, "gwd": 4.0}},
-        train={"num_epochs": 7, "ema_decay": 0.999},
+        train={"ema_decay": 0.999},
     )

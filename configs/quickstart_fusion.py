@@ -26,7 +26,7 @@ import pathlib
 from typing import Any
 
 from radejax.config import Config, load_module, parse_options
-from radejax.data.cameras import CameraOptions
+from radejax.data.options import CameraOptions
 from radejax.models.options import (
     DinoRadeOptions,
     FusionOptions,

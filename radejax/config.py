@@ -2,7 +2,7 @@
 
 A config file has a function `get_config(arg=None)` that returns a `Config`. Presets are changes
 of a config, such as `config.replace(train={"batch_size": 10})`. Every value that a run depends
-on is in its config, and no field is computed from another one later.
+on is in its config; only paths of data that are not given are completed when a run starts.
 """
 
 from __future__ import annotations
@@ -81,7 +81,8 @@ class Config(Options):
 
     @pydantic.model_validator(mode="after")
     def _check(self) -> Config:
-        find_reader(self.data.format).check_options(self.data, self.classes)
+        if ":" not in self.data.format:
+            find_reader(self.data.format).check_options(self.data, self.classes)
         is_different = len(set(self.classes)) == len(self.classes)
         require(is_different, "config.classes", self.classes, "different classes")
         name, count = "config.model.num_classes", self.model.num_classes
@@ -100,6 +101,18 @@ class Config(Options):
                 grid = grid.without_doppler()  # as frames of a reduced release
             check_bins(self.model, grid, "config.simulation.grid")
         return self
+
+    def check_imports(self) -> None:
+        """Imports the reader, loss terms and protocols that are named as "module:Object".
+
+        A model is loaded without them, as inference does not need them.
+
+        Raises:
+            UserError: One cannot be imported, or the reader rejects the options.
+        """
+        find_reader(self.data.format).check_options(self.data, self.classes)
+        self.loss.find_terms()
+        self.evaluation.find_protocols()
 
     def without_data_paths(self) -> dict[str, Any]:
         """Returns plain values for JSON with the data paths (`DATA_PATHS`) emptied."""

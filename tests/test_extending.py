@@ -267,7 +267,7 @@ def test_the_protocol_counts_every_frame() -> None:
 def test_a_wrong_part_is_named(name: str, value: Any, message: str) -> None:
     config, section = _config(), name.partition(".")[0]
     with pytest.raises(UserError, match=rf"^config\.{section}\..*{message}"):
-        config.with_fields({name: value})
+        config.with_fields({name: value}).check_imports()
 
 
 @pytest.mark.slow

@@ -104,9 +104,6 @@ def train(
     from radejax.core.devices import end_with_others
     from radejax.runs.experiment import run, run_seeds
 
-    settings = with_texts(load_config(config), ctx.meta["fields"])
-    data["sequences"] = sequence_numbers
-    settings = settings.replace(data={name: x for name, x in data.items() if x})
     entry.set_up_jax()
     place = coordinator, num_processes, process_id
     workdir = workdir or f"runs/{config_name(config)}"
@@ -115,6 +112,10 @@ def train(
         if distributed or place != (None,) * 3:
             join_processes(*place)
             processes.enter_context(end_with_others())
+        # Parts that a config names are imported, and may use JAX.
+        settings = with_texts(load_config(config), ctx.meta["fields"])
+        data["sequences"] = sequence_numbers
+        settings = settings.replace(data={name: x for name, x in data.items() if x})
         if seeds:
             run_seeds(settings, workdir, seeds, **given)
         else:

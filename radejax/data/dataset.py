@@ -172,14 +172,11 @@ class LabelledFrames(Sequence[_F]):
             the same files; records of another version are not used. None if neither the
             reader nor the files change, which are then not compared with their records.
         has_label_versions: Whether `config.data.label_version` applies to the format.
-        has_files_of_frames: Whether a detector reads the radar files by themselves. It then
-            finds them by the names of K-Radar's files, without their labels.
     """
 
     release: str | None = None
     reader_version: str | None = ""
     has_label_versions = False
-    has_files_of_frames = False
 
     def __init__(
         self,

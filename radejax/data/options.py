@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
@@ -20,7 +21,13 @@ DATA_PATHS = (
 )
 """Fields of `DataOptions` that differ from machine to machine."""
 
-Path = Annotated[str, MinLen(1)]
+Path = Annotated[
+    str,
+    pydantic.BeforeValidator(
+        lambda x: os.fspath(x) if isinstance(x, os.PathLike) else x
+    ),
+    MinLen(1),
+]
 
 
 class CameraOptions(Options, section="config.data.camera"):
@@ -108,7 +115,7 @@ class DataOptions(Options, section="config.data"):
     label_permutation_seed: Annotated[int, Ge(0)] | None = None
     """Sanity check: shuffles the labels of the training frames with this seed."""
     camera: CameraOptions | None = None
-    """Images and calibrations; None for radar-only models."""
+    """Images and calibrations; None for the defaults, or for radar-only models."""
 
     @pydantic.model_validator(mode="after")
     def _check(self) -> DataOptions:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -70,13 +70,20 @@ class EvaluationOptions(Options, section="config.evaluation"):
             values = getattr(self, name)
             is_different = len(set(values)) == len(values)
             require(is_different, f"config.evaluation.{name}", values, "different ones")
+        self.find_protocols(name for name in self.protocols if ":" not in name)
         try:
-            for name in self.protocols:
-                protocols.get_protocol(name)
             roi_bounds(self.roi)
         except UserError as error:
             raise UserError(f"config.evaluation.{error}") from None
         return self
+
+    def find_protocols(self, names: Iterable[str] | None = None) -> None:
+        """Raises `UserError` if there is no protocol of one of the names, by default all."""
+        try:
+            for name in self.protocols if names is None else names:
+                protocols.get_protocol(name)
+        except UserError as error:
+            raise UserError(f"config.evaluation.{error}") from None
 
 
 class ReportOptions(EvaluationOptions):

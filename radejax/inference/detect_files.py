@@ -175,7 +175,7 @@ def find_inputs(
     labels = labels or config.data.labels
     camera_calibration = camera_calibration or config.data.camera_calibration
     reader = find_reader(config.data.format)
-    if reader.has_files_of_frames:
+    if reader is KRadar:  # a derived reader may read frames in another way
         found = find_frames(paths, sequence_numbers, weather)
         return _of_files(found, paths, detector, labels, camera_calibration)
     options = config.data.replace(

@@ -21,10 +21,10 @@ from radejax import models
 from radejax.core.errors import UserError, require
 from radejax.core.files import PathLike, as_path
 from radejax.core.structures import ROIS, Array
-from radejax.data.cameras import CameraOptions, no_camera, read_left_image
+from radejax.data.cameras import no_camera, read_left_image
 from radejax.data.kradar import reduced
 from radejax.data.kradar.tesseract import read_frame
-from radejax.data.options import DataOptions
+from radejax.data.options import CameraOptions, DataOptions
 from radejax.data.projection import MAX_LEVEL, find_problem, to_log_scale
 from radejax.detection.decode import ROI_LIMITS, DecodeOptions, is_roi
 from radejax.geometry.camera import (

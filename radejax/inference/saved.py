@@ -29,9 +29,8 @@ from radejax.config import Config
 from radejax.core import files
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import PathLike
-from radejax.core.structures import CLASSES
-from radejax.data.cameras import CameraOptions
-from radejax.data.options import DataOptions
+from radejax.data.kradar.labels import LABEL_CLASSES
+from radejax.data.options import CameraOptions, DataOptions
 from radejax.detection.decode import DecodeOptions
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.dinorade import IMAGE_BACKBONE
@@ -154,7 +153,7 @@ def load_torch(
         model, variables = radenet_torch.read(tensors, source, **model_overrides)
     config = Config(
         model=model,
-        classes=CLASSES[: model.num_classes],
+        classes=LABEL_CLASSES[: model.num_classes],
         data=DataOptions(azimuth_mapping="stretched", camera=camera),
         decode=DecodeOptions(threshold_inclusive=False),
     )

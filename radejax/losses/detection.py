@@ -62,8 +62,12 @@ class LossOptions(Options, section="config.loss"):
 
     @pydantic.model_validator(mode="after")
     def _check(self) -> LossOptions:
-        terms, names = self.terms, set(self.weights)
-        is_complete = terms.keys() - LOSSES.keys() <= names <= terms.keys()
+        are_places = all(":" in place for place in self.own_terms)
+        name = "config.loss.own_terms"
+        require(are_places, name, self.own_terms, "names like module:function")
+        own = {place.partition(":")[2] for place in self.own_terms}
+        terms = [*LOSSES, *sorted(own)]
+        is_complete = own <= set(self.weights) <= set(terms)
         expected = (
             f"numbers of at least 0, not all 0, for some of {', '.join(terms)}, and for "
             "all of own_terms"
@@ -72,9 +76,12 @@ class LossOptions(Options, section="config.loss"):
         require(is_fine, "config.loss.weights", self.weights, expected)
         return self
 
-    @property
-    def terms(self) -> dict[str, Callable[..., Float[jax.Array, ""]]]:
-        """All losses by the names that `weights` has."""
+    def find_terms(self) -> dict[str, Callable[..., Float[jax.Array, ""]]]:
+        """Returns all losses by the names that `weights` has.
+
+        Raises:
+            UserError: One of `own_terms` cannot be imported.
+        """
         own = {
             place.partition(":")[2]: find_part(place, "config.loss.own_terms", {})
             for place in self.own_terms
@@ -162,7 +169,7 @@ def detection_loss(
         jnp.where(row, expected, 1.0),
         is_matched,
     )
-    functions = options.terms
+    functions = options.find_terms()
     terms = {name: functions[name](pairs, options) for name in options.weights}
     total = _weighted_sum(terms, options.weights, options.normalize)
     terms["weighted_sum"] = _weighted_sum(terms, options.weights, False)

@@ -7,7 +7,7 @@ import typing
 
 import flax.linen as nn
 
-from radejax.core.errors import require
+from radejax.core.errors import UserError, require
 from radejax.core.options import find_part
 from radejax.geometry.radar_grid import AzimuthMapping, RadarGrid
 from radejax.models.dinorade import DinoRade
@@ -45,7 +45,13 @@ def options_class(name: str) -> type[RadeNetOptions]:
     Raises:
         UserError: There is no such model.
     """
-    return typing.get_type_hints(_model_class(name))["options"]
+    try:
+        return typing.get_type_hints(_model_class(name))["options"]
+    except NameError as error:
+        raise UserError(
+            f"config.model.name is {name!r}: {error}; import the types of its attributes "
+            "outside of `if TYPE_CHECKING`"
+        ) from None
 
 
 def _model_class(name: str) -> type[RadeNet]:

@@ -79,7 +79,7 @@ class RadeNetOptions(Options, section="config.model"):
     usual magnitude of a network's input."""
 
     @pydantic.model_validator(mode="after")
-    def _check(self) -> Self:
+    def _check_radenet(self) -> Self:
         find_part(self.backbone, "config.model.backbone", BACKBONES, Backbone)
         find_part(self.neck, "config.model.neck", NECKS, Neck)
         find_part(self.heads, "config.model.heads", HEADS, Head)

@@ -36,6 +36,7 @@ from radejax.models.options import DinoRadeOptions, RadeNetOptions
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
 from radejax.training.options import TrainOptions
+from radejax.training.step import make_schedule
 
 _log = logging.getLogger(__name__)
 
@@ -310,7 +311,8 @@ def open_data(config: Config, model: nn.Module) -> Data:
 
     Raises:
         UserError: Another backbone computed the embeddings, the radar does not fit the
-            model, there are too few frames to train on, or no space is left on the disk.
+            model, there are too few frames to train on, the warm-up is too long, frames of
+            this radar cannot be mirrored, or no space is left on the disk.
         FileNotFoundError: A folder is missing.
     """
     simulate_missing(config)
@@ -334,6 +336,8 @@ def open_data(config: Config, model: nn.Module) -> Data:
             f"{', '.join(config.classes)}, with visibility {config.data.visibility} and "
             "in the field of view: nothing can be learned from them"
         )
+    make_schedule(config.train, len(frames) // config.train.batch_size)
+    Augmentation(data.frames.grid, config.data.mirror_probability)
     data.preprocess()
     _log_input(data, config.model)
     if config.data.validation:

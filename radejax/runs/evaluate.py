@@ -276,6 +276,7 @@ def report_options(config: Config, **changes: Any) -> ReportOptions:
         **dict(config.evaluation),
     }
     options = ReportOptions(**own | changes)
+    options.find_protocols()
     return options.replace(min_score=min(options.min_score, options.score_threshold))
 
 

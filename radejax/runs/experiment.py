@@ -95,6 +95,7 @@ def run(
             left on the disk.
         FileNotFoundError: A path does not exist.
     """
+    config.check_imports()
     config = located(config)
     folder = files.as_path(workdir).absolute()
     mesh = devices.make_mesh() if mesh is None else mesh
@@ -261,13 +262,13 @@ def fit(
         bar = stack.enter_context(hooks.ProgressBar(start, num_steps))
         should_stop = stack.enter_context(devices.stop_on_signal(mesh))
 
-        throughput = hooks.Throughput(data.batches, start)
-        log = hooks.Log(config, data.steps_per_epoch, throughput, writer, bar)
+        timed_batches = hooks.Throughput(data.batches, start)
+        log = hooks.Log(config, data.steps_per_epoch, timed_batches, writer, bar)
         check = hooks.CheckSkipped(config.train.max_skipped_steps)
         save = hooks.Save(checkpoints, data.batches, data.info, check, start)
         due = functools.partial(hooks.every, num_steps)
         log_every_steps = config.train.log_every_steps
-        called: list[Hook] = [throughput, bar, due(log_every_steps, log)]
+        called: list[Hook] = [timed_batches, bar, due(log_every_steps, log)]
         if validate is not None:
 
             def evaluate(step: int, state: TrainState, metrics: Metrics) -> None:
@@ -277,7 +278,7 @@ def fit(
                     _log.warning("the evaluation after step %d is skipped", step)
                     return
                 writer.write(step, scores.values, scores.figures)
-                throughput.restart(step)
+                timed_batches.restart(step)
                 save(step, state, metrics, best=scores.best)
 
             epochs = config.train.evaluate_every_epochs
@@ -291,7 +292,7 @@ def fit(
         state = loop.train(
             state,
             step,
-            throughput,
+            timed_batches,
             called,
             num_steps=num_steps,
             should_stop=should_stop,

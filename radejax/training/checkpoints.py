@@ -41,6 +41,9 @@ _VARIABLES = ("params", "ema_params", "model_state")
 def _without_orbax_log() -> Iterator[None]:
     """Hides what orbax logs while a block runs, as it raises its errors too."""
     log = absl_logging.get_absl_logger()
+    if _is_not_of_orbax in log.filters:  # within another block
+        yield
+        return
     log.addFilter(_is_not_of_orbax)
     try:
         yield

@@ -14,9 +14,9 @@ from radejax import Detector, KRadar, models
 from radejax.cli import figures, main
 from radejax.config import Config
 from radejax.core.errors import DataError, UserError
-from radejax.data.cameras import CameraOptions
 from radejax.data.kradar.radar_files import find_frames
 from radejax.data.kradar.tesseract import read_tesseract
+from radejax.data.options import CameraOptions
 from radejax.data.records import Records
 from radejax.inference.detect_files import front_images
 from radejax.inference.export import export

@@ -11,8 +11,8 @@ from radejax import models
 from radejax.config import Config
 from radejax.core import files
 from radejax.core.errors import UserError
-from radejax.data.cameras import CameraOptions
 from radejax.data.kradar.radar_files import find_frames
+from radejax.data.options import CameraOptions
 from radejax.evaluation.files import Source
 from radejax.evaluation.files import load as load_tables
 from radejax.inference.detect_files import detect_files, find_inputs, front_images

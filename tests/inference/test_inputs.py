@@ -6,8 +6,7 @@ import pytest
 
 from radejax import Detector, UserError
 from radejax.core.structures import Batch
-from radejax.data.cameras import CameraOptions
-from radejax.data.options import DataOptions
+from radejax.data.options import CameraOptions, DataOptions
 from radejax.geometry.camera import (
     KRADAR_RADAR_FROM_LIDAR_Z_M,
     RADAR_FROM_LIDAR_M,

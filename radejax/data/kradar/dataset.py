@@ -129,6 +129,10 @@ class ReadOptions:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "version", normalize_version(self.version))
+        for name in ("visibility", "classes", "sequence_numbers", "weather"):
+            values = getattr(self, name)
+            if not isinstance(values, str | None):  # iterators can be read only once
+                object.__setattr__(self, name, tuple(values))
         if self.visibility is not None:
             _require_known("visibility", self.visibility, VISIBILITY_FLAGS)
         if self.weather is not None:
@@ -549,7 +553,6 @@ class KRadar(LabelledFrames[Frame]):
 
     reader_version = None
     has_label_versions = True
-    has_files_of_frames = True
 
     def __init__(
         self,
@@ -607,7 +610,7 @@ class KRadar(LabelledFrames[Frame]):
         return self._with(frames, summary)
 
     def with_valid_boxes(self, classes: Collection[str]) -> KRadar:
-        """Returns the dataset itself: `labels` checks the boxes when it reads them."""
+        """Returns the dataset itself, whose boxes were checked and selected when read."""
         return self
 
     def class_counts(self) -> dict[str, int]:
