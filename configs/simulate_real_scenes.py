@@ -8,46 +8,27 @@ becomes a simulated radar frame, with K-Radar's split. `docs/reports/2026-11-22_
 the expected numbers and those of a CFAR detector.
 """
 
-from radejax.config import Config, parse_options
-from radejax.losses.detection import LossOptions
-from radejax.models.options import RadeNetOptions
+import pathlib
+
+from radejax.config import Config, load_module, parse_options
 from radejax.simulation.config import SimulationOptions
 
 
 def get_config(arg: str | None = None) -> Config:
     """Return the complete config; there are no variants."""
     parse_options(arg)
-    simulation = SimulationOptions(
-        scenes="labels_v2_1.zip",
-        frame_stride=15,
-        frames_per_sequence=0,
-        image_width=0,
-        image_height=180,
-        output="projection",
-    )
-    grid = simulation.make_grid()
-    return Config(
-        simulation=simulation,
-        model=RadeNetOptions(
-            doppler_bins=grid.num_doppler,
-            elevation_bins=grid.num_elevation,
-            widths=(32, 64, 128),
-            decoder_width=32,
-            num_groups=8,
-            heatmap_prior=0.02,
+    quickstart = load_module(pathlib.Path(__file__).with_name("quickstart.py"))
+    return quickstart.get_config("ablation").replace(
+        simulation=SimulationOptions(
+            scenes="labels_v2_1.zip",
+            frame_stride=15,
+            frames_per_sequence=0,
+            image_width=0,
+            image_height=180,
+            output="projection",
         ),
-        loss=LossOptions(heatmap_sigma_bins=1.0),
-    ).replace(
-        data={"mirror_probability": 0.5},
-        train={
-            "batch_size": 4,
-            "num_epochs": 4,
-            "warmup_steps": 20,
-            "log_every_steps": 20,
-            "checkpoint_every_steps": 100,
-        },
+        train={"batch_size": 4, "num_epochs": 4, "checkpoint_every_steps": 100},
         evaluation={
-            "score_threshold": 0.05,
             "protocols": (
                 "all_point",
                 "kradar_r40",
