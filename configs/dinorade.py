@@ -128,7 +128,7 @@ def get_config(arg: str | None = None) -> Config:
 
 
 def radar_part(model: RadeNetOptions) -> RadeNetOptions:
-    """Return the options of the radar branch of a model alone."""
+    """Return the options of only the radar branch of a model."""
     names = RadeNetOptions.model_fields
     fields = {name: value for name, value in model if name in names}
     return RadeNetOptions(**fields | {"name": "radenet"})

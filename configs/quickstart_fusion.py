@@ -54,7 +54,7 @@ def get_config(arg: str | None = None) -> Config:
     )
     if sensors != "radar":
         config = _with_camera(config, config.simulation)
-        # Without a backbone, it is trained from scratch, without downloads.
+        # Without `pretrained` or `resnet50`, the backbone is trained from scratch.
         image: dict[str, Any] = {"freeze": backbone is not None}
         if backbone == "resnet50":
             # Half a million parameters, as many as the transformer.

@@ -93,7 +93,7 @@ def config_page() -> str:
     """All sections of the config: type, default and meaning of their fields, and presets."""
     parts = [
         "# Config fields",
-        "Every field can be set on the command line, for example "
+        "Every field of a section that the config has can be set on the command line, for example "
         '`--config.train.batch_size=4`, or with `config.replace(train={"batch_size": 4})` in '
         "[Python](../training.md#write-a-config-file). A wrong type or value is an error.",
     ]

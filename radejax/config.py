@@ -1,8 +1,9 @@
 """The config of a run: one typed object from a config file to the saved model.
 
 A config file has a function `get_config(arg=None)` that returns a `Config`. Presets are changes
-of a config, such as `config.replace(train={"batch_size": 10})`. Every value that a run depends
-on is in its config; only paths of data that are not given are completed when a run starts.
+of a config, such as `config.replace(train={"batch_size": 10})`. A config contains all settings
+of a run except the weights that it starts from (`--init-from`). When a run starts, missing data
+paths are completed, and all of them are made absolute.
 """
 
 from __future__ import annotations
@@ -42,9 +43,9 @@ CONFIGS = pathlib.Path(__file__).resolve().parent / "configs"
 class Config(Options):
     """The options of a run.
 
-    The defaults are the paper's training of RADE-Net on K-Radar. Two fields differ from the
-    paper, because the released weights and the reported parameter count differ from it too:
-    `model.cbam` ("official", the released block) and `loss.assignment` ("center").
+    The defaults are the paper's training of RADE-Net on K-Radar. Three fields differ from the
+    paper: `model.cbam` ("official", the released block), `loss.assignment` ("center") and
+    `decode.raw_yaw` ("nms"). `docs/deviations.md` describes them.
     `configs/radenet.py` has presets for the paper and the released code.
     """
 
@@ -105,7 +106,7 @@ class Config(Options):
     def check_imports(self) -> None:
         """Imports the reader, loss terms and protocols that are named as "module:Object".
 
-        A model is loaded without them, as inference does not need them.
+        Loading a model does not import them.
 
         Raises:
             UserError: One cannot be imported, or the reader rejects the options.
@@ -273,7 +274,7 @@ def _read_text(config: Config, name: str, text: str) -> Any:
             return adapter.validate_python(reading, strict=True)
         except pydantic.ValidationError:
             continue
-    # None is allowed: the message is that of the validation of the whole config.
+    # The type allows no reading. The validation of the whole config raises the error.
     return several if isinstance(getattr(place, field), tuple) else literal
 
 

@@ -48,7 +48,7 @@ WHOLE = load_config("quickstart_fusion").with_fields(
         "simulation.grid.max_doppler_mps": 4.0,
     }
 )
-"""A config with all sections, whose fields have values other than None."""
+"""A config with all sections, in which all fields but `simulation.sequences` have values."""
 
 _WRONG: list[tuple[Any, str]] = [
     (
@@ -235,7 +235,9 @@ def test_every_preset_can_be_built_and_stored_as_json(name: str) -> None:
         assert Config(**json.loads(config.model_dump_json())) == config
         assert models.build(config.model).options == config.model
     if name in ("radenet", "dinorade"):
-        assert len(choices) > 40  # every row in both worlds
+        assert (
+            len(choices) > 40
+        )  # every row with the presets of the paper and the released code
 
 
 @pytest.mark.parametrize(

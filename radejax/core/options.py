@@ -37,8 +37,8 @@ _WORDS = (
 class Options(pydantic.BaseModel):
     """Immutable options of one part of the program, which are a section of the config.
 
-    Types and ranges are those of the annotations; nothing is converted, except lists to tuples
-    and integers to floats. A subclass names its section, for example
+    Types and ranges are those of the annotations; values are not converted, except lists to
+    tuples, integers to floats, mappings to sections, and path objects to text. A subclass names its section, for example
     `class TrainOptions(Options, section="config.train")`, which begins every message.
 
     Raises:

@@ -311,7 +311,7 @@ class Boxes:
         return {"cls": self.cls, **score, **box, **self.extras}
 
     def to_list(self) -> list[dict[str, Any]]:
-        """Returns a dictionary with the `fields` of every box as Python numbers and text."""
+        """Returns one dictionary per box, with its `fields` as Python scalars and text."""
         fields = self.fields()
         rows = zip(*(column.tolist() for column in fields.values()), strict=True)
         return [dict(zip(fields, row, strict=True)) for row in rows]

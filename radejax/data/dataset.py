@@ -196,8 +196,8 @@ class LabelledFrames(Sequence[_F]):
         """Reads all frames of a dataset.
 
         Args:
-            options: The section `config.data`. Of the options that choose frames and
-                objects, those that the reader ignores are applied afterwards.
+            options: The section `config.data`. `sequences` and `weather` are applied
+                afterwards if the reader ignores them.
             classes: Classes to detect. Objects of other classes may be left out.
         """
         raise NotImplementedError

@@ -82,7 +82,8 @@ class DataOptions(Options, section="config.data"):
     embeddings: Path | None = None
     """Folder of embedded images (`radejax embed`); None: the images themselves."""
     image_backbone: Path | None = None
-    """Weights of the frozen image backbone: file or folder."""
+    """Weights of the image backbone, or its initial weights if it is trained: file or
+    folder."""
     camera_calibration: Path | None = None
     """Folder of camera calibrations; None: those in the roots."""
     label_version: str = "v2.1"

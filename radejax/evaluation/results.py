@@ -78,7 +78,7 @@ class EvaluationOptions(Options, section="config.evaluation"):
         return self
 
     def find_protocols(self, names: Iterable[str] | None = None) -> None:
-        """Raises `UserError` if there is no protocol of one of the names, by default all."""
+        """Raises `UserError` if one of the names (by default `protocols`) is not a protocol."""
         try:
             for name in self.protocols if names is None else names:
                 protocols.get_protocol(name)

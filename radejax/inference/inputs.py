@@ -1,6 +1,6 @@
 """Conversion of what users pass to a detector into arrays of one batch.
 
-Shapes, types and numbers are checked here, on the host, once per call.
+Shapes, dtypes and counts are checked here, on the host, once per call.
 """
 
 from __future__ import annotations
@@ -86,10 +86,10 @@ class InputReader:
             Projections `[B T, R, A, D+E]` or tensors `[B T, D, R, E, A]`.
 
         Raises:
-            UserError: The shape is that of no radar data, the data have another form than
+            UserError: The shape is not that of radar data, the data have another form than
                 those that the model is for, or there is no frame.
-            DataError: A file is corrupted, or one frame of a reduced release is not as in
-                the release.
+            DataError: A file is corrupted, or shape, dtype or values of a frame differ from
+                those of its reduced release.
         """
         radar = _read_paths(frames, self._read_file)
         if isinstance(radar, list):
@@ -129,7 +129,7 @@ class InputReader:
         return read_frame(path, self.grid)
 
     def _projected(self, frames: Any) -> Real[Any, "..."]:
-        """Convert an array to numbers, and frames of a reduced release to projections."""
+        """Convert to an array that JAX accepts; frames of a reduced release become projections."""
         array = as_numbers(frames, "frames")
         if reduced.is_reduced(array, self.grid):
             if array.shape[1] != 4:  # an error below explains points [N, 4]

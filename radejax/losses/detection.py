@@ -77,7 +77,7 @@ class LossOptions(Options, section="config.loss"):
         return self
 
     def find_terms(self) -> dict[str, Callable[..., Float[jax.Array, ""]]]:
-        """Returns all losses by the names that `weights` has.
+        """Returns all loss functions by name, those of `own_terms` included.
 
         Raises:
             UserError: One of `own_terms` cannot be imported.
@@ -105,7 +105,7 @@ def detection_loss(
         maps: Predictions, `[B, R, A, C]` logits and `[B, R, A, 8]` box parameters.
         batch: Ground truth, of which `boxes`, `classes` and `is_valid` are used.
         grid: The grid of the maps, padded if they are.
-        options: Options of the loss; the defaults are those of the paper's loss.
+        options: Options of the loss; the defaults are the paper's except for `assignment`.
         decoding: Thresholds of peaks and NMS for the assignment "nms", which should be
             those of inference.
 

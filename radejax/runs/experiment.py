@@ -223,8 +223,8 @@ def fit(
     """Trains a model for the configured epochs or steps, or continues from a checkpoint.
 
     Args:
-        config: Config of the run, of which the fields `seed`, `train`, `loss`, `decode`
-            and `logging` are used.
+        config: Config of the run. `seed`, `train`, `loss`, `decode` and `logging`
+            determine the training.
         model: Model, which is called as `model.apply(variables, *inputs, train=True)`.
         data: Data to train on.
         workdir: Folder of checkpoints and logs.

@@ -140,7 +140,8 @@ class SimulationOptions(Options, section="config.simulation"):
     """Version of the real labels."""
     frames_per_sequence: Count = 20
     """Number of frames per sequence, at 10 frames per second in procedural scenes; 0: all
-    frames of real labels. Two or more frames of real labels are in both splits of K-Radar."""
+    frames of real labels. With two or more,
+    both of K-Radar's splits have some frames of a sequence of real labels."""
     frame_stride: AtLeastOne = 1
     """Stride at which the frames of real labels are used."""
     # A larger factor leaves no space for other road users.

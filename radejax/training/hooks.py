@@ -1,7 +1,7 @@
 """Hooks of the training loop: functions that are called after each step.
 
 A hook is a function `hook(step, state, metrics)` of the number of steps taken, the state after
-them, and the metrics of the last one. The arrays may still be computed when it is called.
+them, and the metrics of the last one. The computation of the arrays may not be finished when it is called.
 """
 
 from __future__ import annotations
@@ -65,8 +65,8 @@ class ProgressBar(tqdm.tqdm):
 class Throughput:
     """Iterator over batches that measures the rate of steps and the waits for batches.
 
-    It is also the first hook of the loop. If the metrics of the last step are ready when a
-    batch is, the devices had nothing to do, and the time that the batch took is counted.
+    It is also the first hook of the loop. If the last step is finished when the next
+    batch arrives, the devices were idle, and the time of reading the batch is counted as waiting.
 
     Args:
         batches: Endless iterator.
@@ -197,7 +197,7 @@ class CheckSkipped:
 
 @dataclasses.dataclass
 class Save:
-    """Hook that saves a checkpoint, unless that of the step is saved.
+    """Hook that saves a checkpoint, unless the step is already saved.
 
     Attributes:
         checkpoints: Checkpoints of the run.

@@ -71,7 +71,7 @@ class TrainOptions(Options, section="config.train"):
 
 
 class LoggingOptions(Options, section="config.logging"):
-    """Logs of a training beside `metrics.jsonl` and TensorBoard."""
+    """Logs of a training in addition to `metrics.jsonl` and TensorBoard."""
 
     num_visualizations: Count = 4
     """Number of figures of fixed frames at every evaluation during training."""

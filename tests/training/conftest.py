@@ -81,7 +81,7 @@ def tiny() -> Tiny:
             widths=(8, 8, 16),
             decoder_width=8,
             num_groups=4,
-            cbam="off",  # the loop does not care, and the compiler is done sooner
+            cbam="off",  # irrelevant for the loop, and compiles faster
             neck="plain",
             heads="default",
             heatmap_prior=0.1,
