@@ -34,7 +34,6 @@ The weights of the image backbone are not part of a config; `train.py --image-ba
 """
 
 import pathlib
-import types
 from typing import Any
 
 from radejax.config import Config, load_module, parse_options
@@ -42,12 +41,6 @@ from radejax.data.options import CameraOptions
 from radejax.geometry.camera import KRADAR_RADAR_FROM_LIDAR_Z_M
 from radejax.models.lifting import OFFICIAL_OFFSET_M
 from radejax.models.options import DinoRadeOptions, QueryGridOptions, RadeNetOptions
-
-
-def _radenet() -> types.ModuleType:
-    """Load the config of the radar branch, whose presets apply here too."""
-    return load_module(pathlib.Path(__file__).with_name("radenet.py"))
-
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "r": {},
@@ -94,7 +87,7 @@ CLASS_SETS = ("all", "sedan")
 
 def get_config(arg: str | None = None) -> Config:
     """Return the complete config; see the module docstring for `arg`."""
-    radenet = _radenet()
+    radenet = load_module(pathlib.Path(__file__).with_name("radenet.py"))
     variant, preset, sigma, classes, release = parse_options(
         arg, VARIANTS, PRESETS, radenet.SIGMAS, CLASS_SETS, radenet.RELEASES
     )

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import ast
 import importlib.util
-import json
 import os
 import pathlib
 import types
@@ -118,7 +117,7 @@ class Config(Options):
     def without_data_paths(self) -> dict[str, Any]:
         """Returns plain values for JSON with the data paths (`DATA_PATHS`) emptied."""
         empty: dict[str, Any] = {**dict.fromkeys(DATA_PATHS), "roots": ()}
-        return json.loads(self.replace(data=empty).model_dump_json())
+        return self.replace(data=empty).model_dump(mode="json")
 
 
 def check_bins(model: RadeNetOptions, grid: RadarGrid, source: str) -> None:

@@ -194,11 +194,10 @@ def test_objects_that_cannot_be_learned_are_left_out_and_counted(
     content = dict(np.load(path)) | {"boxes": boxes, "classes": np.array(["Sedan"] * 5)}
     np.savez(path, **content)
     config = located(_config().replace(data={"roots": (str(root),)}))
-    model = models.build(config.model)
-    data = Data(config, model)
-    part = Data(config.replace(data={"sequences": (2,)}), model)
+    data = Data(config)
+    part = Data(config.replace(data={"sequences": (2,)}))
     assert [frame.sequence for frame in part.split("test")] == [2, 2]
-    part = Data(config.replace(data={"sequences": (1,)}), model)  # of the train split
+    part = Data(config.replace(data={"sequences": (1,)}))  # of the train split
     with pytest.raises(UserError, match="no frames of the test split"):
         part.split("test")
     assert data.frames[0].boxes.tolist() == [good]
@@ -209,7 +208,7 @@ def test_objects_that_cannot_be_learned_are_left_out_and_counted(
     assert counts["objects left out: field of view"] == 2
     np.savez(path, **content | {"boxes": np.array([[*good[:6], 90.0]] * 5)})
     with pytest.raises(UserError, match=r"frame 1/0001: yaw is 90, expected radians"):
-        Data(config, model)
+        Data(config)
 
 
 def test_written_folders_are_read(

@@ -317,7 +317,7 @@ def test_what_does_not_fit_is_rejected(data, from_images, embeddings, tmp_path):
 
     def open_data(fields):
         changed = config.replace(data=paths).with_fields(fields)
-        return Data(changed, build(changed.model))
+        return Data(changed)
 
     plain = config.with_fields({"model.image.standardize": False}).model.image
     deeper = config.with_fields({"model.image.num_layers": 12})

@@ -38,8 +38,9 @@ class Options(pydantic.BaseModel):
     """Immutable options of one part of the program, which are a section of the config.
 
     Types and ranges are those of the annotations; values are not converted, except lists to
-    tuples, integers to floats, mappings to sections, and path objects to text. A subclass names its section, for example
-    `class TrainOptions(Options, section="config.train")`, which begins every message.
+    tuples, integers to floats, mappings to sections, and path objects to text. A subclass
+    names its section, for example `class TrainOptions(Options, section="config.train")`,
+    which begins every message.
 
     Raises:
         UserError: A field is unknown, missing, of another type or out of its range.
@@ -54,13 +55,10 @@ class Options(pydantic.BaseModel):
     )
     section: ClassVar[str] = "config"
 
-    @classmethod
-    def __pydantic_init_subclass__(cls, section: str = "", **_: Any) -> None:
-        if section:
-            cls.section = section
-
     def __init_subclass__(cls, section: str = "", **options: Any) -> None:
         super().__init_subclass__(**options)
+        if section:
+            cls.section = section
 
     def __init__(self, **values: Any) -> None:
         values = {name: as_tuples(value) for name, value in values.items()}

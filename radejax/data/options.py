@@ -60,7 +60,7 @@ class CameraOptions(Options, section="config.data.camera"):
             own_z_m: z of the frame's t according to the mounting positions.
         """
         if self.radar_from_lidar_m is not None:
-            return tuple(map(float, self.radar_from_lidar_m))
+            return self.radar_from_lidar_m
         z = self.radar_from_lidar_z_m
         return tuple(map(float, (*own_m[:2], own_z_m if z is None else z)))
 

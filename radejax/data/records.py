@@ -231,7 +231,7 @@ def open_embeddings(
 def embedding_fields(image_config: Mapping[str, Any]) -> dict[str, Any]:
     """Returns the part of `config.model.image` that embeddings depend on, in JSON types."""
     irrelevant = ("freeze", "attention", "layer_scale")
-    plain = {k: v for k, v in dict(image_config).items() if k not in irrelevant}
+    plain = {k: v for k, v in image_config.items() if k not in irrelevant}
     return json.loads(json.dumps(plain))
 
 

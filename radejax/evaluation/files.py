@@ -18,6 +18,7 @@ from radejax.core import files
 from radejax.core.archives import read_npz
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike
+from radejax.core.options import as_tuples
 from radejax.core.structures import BOX_FIELDS, Boxes
 from radejax.data.kradar import KRadar
 from radejax.evaluation import boxes
@@ -250,7 +251,7 @@ def stored_options(path: PathLike) -> dict[str, Any]:
             found = {"classes": files.read_object(config, "classes")["classes"]}
     if (place / "metrics.json").is_file():
         found = files.read_object(place / "metrics.json", "options")["options"]
-    return {name: tuple(x) if isinstance(x, list) else x for name, x in found.items()}
+    return as_tuples(found)
 
 
 def _read_frames(path: PathLike) -> Columns:

@@ -179,9 +179,9 @@ def find_inputs(
         found = find_frames(paths, sequence_numbers, weather)
         return _of_files(found, paths, detector, labels, camera_calibration)
     options = config.data.replace(
-        roots=tuple(map(str, paths)),
-        labels=None if labels is None else str(labels),
-        camera_calibration=camera_calibration and str(camera_calibration),
+        roots=tuple(paths),
+        labels=labels,
+        camera_calibration=camera_calibration,
         sequences=tuple(sequence_numbers or ()),
         weather=tuple(weather or ()),
     )

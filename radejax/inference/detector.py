@@ -130,7 +130,7 @@ class Detector:
         self.takes_camera = models.has_camera(self.model)
         self.camera_options = config.data.used_camera
         self._reader = InputReader(self.model, self.grid, config.data)
-        self.classes = tuple(config.classes)
+        self.classes = config.classes
         self.decode_options = config.decode
         self.sharding = sharding or SingleDeviceSharding(jax.devices()[0])
         self.replicated = self.sharding

@@ -30,7 +30,7 @@ class Fusion(Part):
         remat: Recompute the necks in the backward pass instead of storing their blocks.
     """
 
-    options: FusionOptions = FusionOptions()
+    options: FusionOptions
 
     @nn.compact
     def __call__(

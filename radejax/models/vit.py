@@ -49,7 +49,7 @@ class ViT(Layer):
         remat: Recompute blocks in the backward pass instead of storing them.
     """
 
-    options: ViTOptions = ViTOptions()
+    options: ViTOptions
     remat: bool = False
 
     @nn.compact

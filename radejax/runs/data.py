@@ -9,7 +9,6 @@ import logging
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-import flax.linen as nn
 import grain
 import jax
 import numpy as np
@@ -51,7 +50,6 @@ class Data:
 
     Args:
         config: Config of the run with absolute paths, see `located`.
-        model: The model that `config.model` describes.
 
     Attributes:
         options: The section `config.data`.
@@ -67,20 +65,20 @@ class Data:
         FileNotFoundError: A folder is missing.
     """
 
-    def __init__(self, config: Config, model: Any) -> None:
+    def __init__(self, config: Config) -> None:
         options = self.options = config.data
         assert options.records is not None  # `located` fills it in
         self._records_folder = options.records
-        self.classes = tuple(config.classes)
+        self.classes = config.classes
         self.camera: CameraOptions | None = None
         self.features: Records | None = None
-        self._model = model
         self._skipped = set[str]()
         self._splits: dict[str, LabelledFrames] = {}
         image = None
         if isinstance(config.model, DinoRadeOptions):
             self.camera = options.used_camera
             image = config.model.image
+            self._image_size = image.size
         if options.embeddings is not None:
             if image is None or not image.freeze or options.mirror_probability:
                 raise UserError(
@@ -191,7 +189,7 @@ class Data:
         """
         if self.camera is None:
             return None
-        size = self._model.options.image.size
+        size = self._image_size
         return cameras.camera_inputs(frames, size, self.camera, self.features)
 
     def training_batches(
@@ -300,14 +298,13 @@ def simulate_missing(config: Config) -> None:
         devices.main_only(lambda: simulate_dataset(simulation, root))
 
 
-def open_data(config: Config, model: nn.Module) -> Data:
+def open_data(config: Config) -> Data:
     """Simulate the data if the config requires it, write missing records, and open all.
 
     With several processes, the main process writes the files before the others read them.
 
     Args:
         config: Config of the run with absolute paths, see `located`.
-        model: The model that `config.model` describes.
 
     Raises:
         UserError: Another backbone computed the embeddings, the radar does not fit the
@@ -316,7 +313,7 @@ def open_data(config: Config, model: nn.Module) -> Data:
         FileNotFoundError: A folder is missing.
     """
     simulate_missing(config)
-    data = Data(config, model)
+    data = Data(config)
     _log.info("%s", data.frames.summary().to_text())
     used = {f.key for name in ("train", "test") for f in data.frames.of_split(name)}
     if unused := [frame.key for frame in data.split("all") if frame.key not in used]:
@@ -400,7 +397,7 @@ def data_of_run(
         paths = dict.fromkeys(name for name in DATA_PATHS if name != "roots")
         changes = {"sequences": (), "weather": (), **paths} | changes
     config = _with_paths(saved.config.replace(data=changes), roots)
-    data = Data(config, saved.model)
+    data = Data(config)
     found = data.frames.grid
     name = f"the radar of {config.data.roots[0]}"
     expected = f"{records.describe_grid(saved.grid)}, as the model was trained"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
 import math
 import pathlib
@@ -124,7 +123,7 @@ class Evaluation:
             devices.Stopped: `should_stop` returned True.
         """
         predictions = self.predict(variables, progress=False, should_stop=should_stop)
-        data = make_set(self._truth, predictions.columns(), self._table, self._options)
+        data = make_set(self._truth, predictions, self._table, self._options)
         # Without the frame table, there are no weathers and no intervals.
         aps = named_aps(compute_results(data, {}, self._options))
         main = f"{self._config.train.best_metric}/{self._options.protocols[0]}/"
@@ -163,7 +162,7 @@ class Evaluation:
                 files.write_json(folder / "source.json", {"step": step, **self._source})
                 report = write_report(
                     self._truth,
-                    predictions.columns(),
+                    predictions,
                     self._table,
                     folder,
                     self._options,
@@ -226,13 +225,13 @@ class Evaluation:
         frame = self._frames[index]
         records = self._data.records
         threshold = self._config.decode.score_threshold
-        found = predictions.take(predictions.frame == index)
-        assert found.score is not None  # of predictions
+        assert predictions.score is not None
+        is_drawn = (predictions.frame == index) & (predictions.score >= threshold)
         return figures.frame_scene(
             frame,
             decode(records[frame.key]),
             records.grid,
-            predictions=found.take(found.score >= threshold),
+            predictions=predictions.take(is_drawn),
             roi=roi_bounds(self._options.roi),
             score_threshold=threshold,
             **fields,
@@ -376,7 +375,7 @@ def source_of(
         "split": split,
         "shuffle_images": shuffle_images,
         "simulated": data.frames.is_simulated,
-        **json.loads(data.options.model_dump_json()),
+        **data.options.model_dump(mode="json"),
     }
 
 

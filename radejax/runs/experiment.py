@@ -19,7 +19,6 @@ import csv
 import dataclasses
 import functools
 import hashlib
-import json
 import logging
 import pathlib
 import shlex
@@ -116,7 +115,7 @@ def run(
     with claimed(folder, config):
         # Data -------------------------------------------------------------------------
 
-        data = open_data(config, model)
+        data = open_data(config)
         frames, grid = data.split("train"), data.records.grid
         has_test = len(data.split("test", may_be_empty=True)) > 0
         if not has_test:
@@ -138,20 +137,26 @@ def run(
 
         # Model, state and training ----------------------------------------------------
 
-        def initial(batch: Batch) -> Variables:
-            return initial_variables(model, config.seed, batch, variables, pretrained)
+        @functools.cache  # the splits of both evaluations may be the same
+        def evaluation(split: str) -> Evaluation:
+            return Evaluation(config, data, split, mesh=mesh)
 
         validate = None
         if config.train.evaluate_every_epochs:
-            evaluation = Evaluation(config, data, data.choosing_split, mesh=mesh)
-            validate = evaluation.validate
+            validate = evaluation(data.choosing_split).validate
         state, is_finished = fit(
             config,
             model,
             training_data,
             folder,
             mesh,
-            initial=initial,
+            initial=functools.partial(
+                initial_variables,
+                model,
+                config.seed,
+                variables=variables,
+                pretrained=pretrained,
+            ),
             validate=validate,
             profile=str(profile),
         )
@@ -163,8 +168,7 @@ def run(
         # Report -----------------------------------------------------------------------
 
         if has_test:
-            evaluation = Evaluation(config, data, mesh=mesh)
-            report = evaluation.report(state.eval_variables, folder, step=step)
+            report = evaluation("test").report(state.eval_variables, folder, step=step)
             if report is not None:
                 log_results(folder, step, named_aps(report.results))
     place = files.relative(folder)
@@ -414,7 +418,7 @@ def checkpoint_info(
         run: Result of `run_info`.
         same: Values by name that must not change when the run continues.
     """
-    values = {"config": json.loads(config.model_dump_json()), "grid": grid.to_dict()}
+    values = {"config": config.model_dump(mode="json"), "grid": grid.to_dict()}
     return {**values, "run": dict(run), "same": dict(same)}
 
 

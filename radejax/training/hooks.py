@@ -1,7 +1,8 @@
 """Hooks of the training loop: functions that are called after each step.
 
 A hook is a function `hook(step, state, metrics)` of the number of steps taken, the state after
-them, and the metrics of the last one. The computation of the arrays may not be finished when it is called.
+them, and the metrics of the last one. The computation of the arrays may not be finished when
+it is called.
 """
 
 from __future__ import annotations

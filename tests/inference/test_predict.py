@@ -48,7 +48,7 @@ def setup(tmp_path_factory):
         logging={"num_visualizations": 1},
     )
     model = models.build(config.model)
-    data = Data(config, model)
+    data = Data(config)
     preprocess(data.frames, folder / "records", num_workers=0, progress=False)
     records = data.records
     variables = drawn(model, np.zeros((1, *records.grid.projection_shape)))

@@ -44,7 +44,7 @@ def _config(*roots: object, batch_size: int = 1, **fields: Any) -> Config:
 
 
 def _open(config: Config) -> Data:
-    return open_data(located(config), models.build(config.model))
+    return open_data(located(config))
 
 
 def test_without_data_and_simulation_the_flag_is_named() -> None:

@@ -75,10 +75,9 @@ def read_description(path: PathLike) -> Conditions:
     return Conditions(*fields)
 
 
-def check_weather(names: Iterable[str]) -> tuple[str, ...]:
-    """Returns the names; raises a `UserError` if there are none or one is unknown."""
+def check_weather(names: Iterable[str]) -> None:
+    """Raises a `UserError` if there are no names or one is unknown."""
     names = tuple(names)
     known = (*WEATHERS, "unknown")
     if not names or not set(names) <= set(known):
         raise UserError(f"unknown weather {names}; available: {', '.join(known)}")
-    return names
