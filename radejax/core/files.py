@@ -18,6 +18,8 @@ from typing import IO, Any
 from radejax.core.errors import DataError, DiskFullError, UserError
 
 PathLike = str | os.PathLike[str]
+JsonObject = dict[str, Any]
+"""A JSON object whose fields a reader checks one by one, or the values of one to write."""
 
 _log = logging.getLogger(__name__)
 
@@ -247,7 +249,7 @@ def read_json(path: PathLike) -> Any:
         raise DataError(f"{path} is not valid JSON: {error}") from None
 
 
-def read_object(path: PathLike, *keys: str) -> dict[str, Any]:
+def read_object(path: PathLike, *keys: str) -> JsonObject:
     """Reads a JSON file that contains an object with the given keys.
 
     Raises:
