@@ -51,9 +51,10 @@ class Augmentation:
     mirror_probability: float = 0.0
 
     def __post_init__(self) -> None:
-        azimuth, step = self.grid.azimuth_rad, self.grid.azimuth_step_rad
+        azimuth = self.grid.azimuth_rad
         asymmetry = np.abs(azimuth + azimuth[::-1]).max()
-        if self.mirror_probability and asymmetry > 1e-3 * abs(step):
+        largest = 1e-3 * abs(self.grid.azimuth_step_rad)
+        if self.mirror_probability and asymmetry > largest:
             raise UserError(
                 f"cannot mirror: azimuths {azimuth[0]:.4f} to {azimuth[-1]:.4f} rad are "
                 "not symmetric; set config.data.mirror_probability to 0"

@@ -161,7 +161,7 @@ class CameraInputs:
         """Returns the image or features of one frame; zeros if they are missing."""
         source = self.sources[index]
         if source is None:
-            return self.empty_images(1)[0]
+            return self.empty_images(1).squeeze(axis=0)
         if self.features is not None:
             return self.features[str(source)]
         return read_left_image(

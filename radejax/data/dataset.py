@@ -12,12 +12,13 @@ import copy
 import dataclasses
 import pathlib
 from collections.abc import Collection, Sequence
-from typing import Any, Self, TypeVar
+from typing import Any, Self, TypeVar, overload
 
 import numpy as np
 from jaxtyping import Float, Shaped
 
 from radejax.core.errors import UserError
+from radejax.core.files import JsonObject
 from radejax.core.options import find_part
 from radejax.data.options import DataOptions
 from radejax.geometry.camera import CameraCalibration
@@ -57,7 +58,7 @@ class Summary:
         """Returns the number of problems of every kind."""
         return dict(collections.Counter(kind for kind, _ in self.problems))
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Returns the summary as JSON values."""
         return {
             "counts": dict(self.counts),
@@ -150,7 +151,7 @@ class LabelledFrame:
 FrameSequence = Sequence[LabelledFrame]
 """A dataset, or a part of one, of which only the frames are read."""
 
-_F = TypeVar("_F", bound=LabelledFrame)
+_F = TypeVar("_F", bound=LabelledFrame, covariant=True)
 
 
 class LabelledFrames(Sequence[_F]):
@@ -217,7 +218,13 @@ class LabelledFrames(Sequence[_F]):
     def __len__(self) -> int:
         return len(self._frames)
 
-    def __getitem__(self, index: Any) -> Any:
+    @overload
+    def __getitem__(self, index: int) -> _F: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[_F]: ...
+
+    def __getitem__(self, index: int | slice) -> _F | Sequence[_F]:
         return self._frames[index]
 
     def summary(self) -> Summary:
@@ -229,7 +236,7 @@ class LabelledFrames(Sequence[_F]):
         """Numbers of items that were read and skipped, by reason (`summary().counts`)."""
         return self._summary.counts
 
-    def _with(self, frames: Sequence[_F], summary: Summary) -> Self:
+    def _with(self, frames: Sequence[Any], summary: Summary) -> Self:
         """Returns the dataset with other frames."""
         other = copy.copy(self)
         other._frames = frames
@@ -274,35 +281,35 @@ class LabelledFrames(Sequence[_F]):
             UserError: Yaws are in degrees.
         """
         counts = collections.Counter[str]()
-        frames = [self._valid(frame, classes, counts) for frame in self]
+        frames: list[LabelledFrame] = []
+        for frame in self:
+            boxes = np.asarray(frame.boxes, np.float64).reshape(-1, 7)
+            names = np.asarray(frame.classes)
+            others = set(names.tolist()).difference(classes)
+            reasons = {f"class {name!r}": names == name for name in sorted(others)} | {
+                "a value is not finite": ~np.isfinite(boxes).all(axis=1),
+                "a size is not above 0": ~(boxes[:, 3:6] > 0).all(axis=1),
+                "field of view": ~self.grid.in_field_of_view(*boxes[:, :2].T),
+            }
+            kept = np.ones(len(boxes), bool)
+            for reason, is_wrong in reasons.items():
+                counts[f"objects left out: {reason}"] += int((kept & is_wrong).sum())
+                kept &= ~is_wrong
+            yaw = boxes[kept, 6]
+            if (np.abs(yaw) > _MAX_YAW_RAD).any():
+                raise UserError(
+                    f"frame {frame.key}: yaw is {yaw[np.abs(yaw).argmax()]:g}, expected "
+                    "radians"
+                )
+            if not kept.all():
+                frame = dataclasses.replace(
+                    frame, boxes=boxes[kept], classes=names[kept]
+                )
+            frames.append(frame)
         return self._with(frames, self._summary.plus(Summary(counts)))
 
-    def _valid(
-        self, frame: _F, classes: Collection[str], counts: collections.Counter[str]
-    ) -> _F:
-        boxes = np.asarray(frame.boxes, np.float64).reshape(-1, 7)
-        names = np.asarray(frame.classes)
-        others = set(names.tolist()).difference(classes)
-        reasons = {f"class {name!r}": names == name for name in sorted(others)} | {
-            "a value is not finite": ~np.isfinite(boxes).all(axis=1),
-            "a size is not above 0": ~(boxes[:, 3:6] > 0).all(axis=1),
-            "field of view": ~self.grid.in_field_of_view(*boxes[:, :2].T),
-        }
-        kept = np.ones(len(boxes), bool)
-        for reason, is_wrong in reasons.items():
-            counts[f"objects left out: {reason}"] += int((kept & is_wrong).sum())
-            kept &= ~is_wrong
-        yaw = boxes[kept, 6]
-        if (np.abs(yaw) > _MAX_YAW_RAD).any():
-            raise UserError(
-                f"frame {frame.key}: yaw is {yaw[np.abs(yaw).argmax()]:g}, expected radians"
-            )
-        if kept.all():
-            return frame
-        return dataclasses.replace(frame, boxes=boxes[kept], classes=names[kept])
 
-
-def find_reader(name: str) -> type[LabelledFrames]:
+def find_reader(name: str) -> type[LabelledFrames[LabelledFrame]]:
     """Returns the reader of a format.
 
     Args:
@@ -312,7 +319,10 @@ def find_reader(name: str) -> type[LabelledFrames]:
         UserError: There is no such name, or the class cannot be imported.
     """
     place = "radejax.data.kradar:KRadar" if name == "kradar" else name
-    return find_part(place, "config.data.format", {"kradar": None}, LabelledFrames)
+    reader: type[LabelledFrames[LabelledFrame]] = find_part(
+        place, "config.data.format", {"kradar": None}, LabelledFrames
+    )
+    return reader
 
 
 def held_out(

@@ -16,9 +16,8 @@ from radejax.geometry.camera import ImageKind
 from radejax.geometry.radar_grid import AzimuthMapping
 
 DATA_PATHS = (
-    *("roots", "labels", "records", "embeddings", "image_backbone"),
-    "camera_calibration",
-)
+    "roots", "labels", "records", "embeddings", "image_backbone", "camera_calibration",
+)  # fmt: skip
 """Fields of `DataOptions` that differ from machine to machine."""
 
 Path = Annotated[

@@ -13,7 +13,6 @@ import functools
 import logging
 import re
 from collections.abc import Iterable, Sequence
-from typing import Any
 
 import grain
 import jax
@@ -235,8 +234,9 @@ def make_loader(
         num_threads=num_batches, prefetch_buffer_size=num_batches
     )
     order = _make_order(len(table), options).repeat(options.num_epochs)
-    load: Any = _LoadBatch(table, augment, num_threads)
-    batches: grain.MapDataset[Batch] = order.map(load)
+    batches: grain.MapDataset[Batch] = order.map(
+        _LoadBatch(table, augment, num_threads)
+    )
     return iter(batches.to_iter_dataset(reading))
 
 
@@ -263,9 +263,11 @@ def _make_order(
 
     Frame indices of `num_frames` and above are padding.
     """
-    index, count = options.process_index, options.process_count
+    index = options.process_index
+    count = options.process_count
     if index is None or count is None:
-        index, count = jax.process_index(), jax.process_count()
+        index = jax.process_index()
+        count = jax.process_count()
     rows = options.batch_size * count
     total = num_frames
     if options.pad_remainder:
@@ -302,9 +304,9 @@ class _LoadBatch(grain.transforms.Map):
     ) -> None:
         self._table = table
         self._augment = augment
-        self._map: Any = map
+        self._pool = None
         if num_threads:
-            self._map = concurrent.futures.ThreadPoolExecutor(num_threads).map
+            self._pool = concurrent.futures.ThreadPoolExecutor(num_threads)
 
     def __repr__(self) -> str:
         return "_LoadBatch()"
@@ -313,10 +315,10 @@ class _LoadBatch(grain.transforms.Map):
         batch = self._empty(len(element))
         fill = functools.partial(self._fill, batch)
         indices, seeds = element.T.tolist()
-        cameras = list(self._map(fill, range(len(element)), indices, seeds))
-        if self._table.images is None:
-            return batch
-        return batch.replace(camera=stack_cameras(cameras))
+        apply = self._pool.map if self._pool else map
+        rows = apply(fill, range(len(element)), indices, seeds)
+        cameras = [camera for camera in rows if camera is not None]
+        return batch.replace(camera=stack_cameras(cameras)) if cameras else batch
 
     def _fill(self, batch: Batch, row: int, index: int, seed: int) -> Camera | None:
         """Reads one frame into a row of a batch; returns its camera, if there are any."""

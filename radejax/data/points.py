@@ -66,7 +66,8 @@ def cfar_points(
     r, a = r[order], a[order]
     azimuth_rad = grid.azimuth_rad[a]
     e = np.zeros_like(r)
-    elevation_rad, doppler_mps = np.zeros(r.size), np.full(r.size, np.nan)
+    elevation_rad = np.zeros(r.size)
+    doppler_mps = np.full(r.size, np.nan)
     if grid.num_elevation:
         e = elevation[r, a].argmax(-1)
         elevation_rad = grid.elevation_rad[e]
@@ -98,4 +99,5 @@ def local_mean_db(
     whole = uniform_filter(power, outer, mode="nearest") * outer**2
     guard = uniform_filter(power, inner, mode="nearest") * inner**2
     mean = (whole - guard) / (outer**2 - inner**2)
-    return 10.0 * np.log10(np.maximum(mean, 1e-10))
+    mean_db: np.ndarray = 10.0 * np.log10(np.maximum(mean, 1e-10))
+    return mean_db

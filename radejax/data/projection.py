@@ -145,9 +145,10 @@ def to_log_scale(
     power: Float[np.ndarray, "*cells"], out: Float[np.ndarray, "*cells"] | None = None
 ) -> Float[np.ndarray, "*cells"]:
     """Converts linear power to the normalized decibels of the network input."""
-    level = np.log10(power + power.dtype.type(POWER_FLOOR))
+    level: np.ndarray = np.log10(power + power.dtype.type(POWER_FLOOR))
     level *= 10.0 / LOG_SCALE_DB
-    return np.add(level, LOG_OFFSET_DB / LOG_SCALE_DB, out=out)
+    scaled: np.ndarray = np.add(level, LOG_OFFSET_DB / LOG_SCALE_DB, out=out)
+    return scaled
 
 
 def find_problem(
@@ -224,7 +225,8 @@ def encode(
     0.76, far below the noise of K-Radar, and p = 1 to 2.0e18, far above its echoes.
     """
     if encoding == "uint8":
-        return np.rint(np.clip(projection, 0.0, 1.0) * 255.0).astype(np.uint8)
+        levels: np.ndarray = np.clip(projection, 0.0, 1.0) * 255.0
+        return levels.round().astype(np.uint8)
     return projection.astype(encoding)
 
 

@@ -19,7 +19,6 @@ import math
 import pathlib
 import time
 from collections.abc import Generator, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from jaxtyping import Real
@@ -56,7 +55,7 @@ class Records:
     folder: pathlib.Path
     shape: tuple[int, ...]
     dtype: str
-    source: Mapping[str, Any]
+    source: files.JsonObject
 
     @classmethod
     def open(cls, folder: files.PathLike) -> Records:
@@ -75,9 +74,10 @@ class Records:
         content = files.read_json(path)
         what = "a description of records: delete the folder and write it again"
         with wrap_read_errors(path, what):
-            shape, dtype = tuple(map(int, content["shape"])), content["dtype"]
+            dtype = content["dtype"]
             if dtype not in ENCODINGS:
                 raise ValueError(f"dtype is {dtype!r:.80}")
+            shape = tuple(map(int, content["shape"]))
             return cls(path.parent, shape, dtype, dict(content["source"]))
 
     @classmethod
@@ -86,7 +86,7 @@ class Records:
         folder: files.PathLike,
         shape: Sequence[int],
         dtype: str | None,
-        source: Mapping[str, Any],
+        source: files.JsonObject,
         default_dtype: str = "float16",
     ) -> Records:
         """Creates records in a new folder, or opens existing ones of the same kind.
@@ -201,7 +201,7 @@ def open_projections(folder: files.PathLike, grid: RadarGrid | None = None) -> R
 
 
 def open_embeddings(
-    folder: files.PathLike, image_config: Mapping[str, Any] | None = None
+    folder: files.PathLike, image_config: files.JsonObject | None = None
 ) -> Records:
     """Opens the front image features `[h, w, C]` in a folder.
 
@@ -215,9 +215,9 @@ def open_embeddings(
         UserError: Another backbone made the embeddings.
     """
     records = Records.open(folder)
-    image: Any = records.source.get("image")
-    is_complete = isinstance(image, dict) and "weights_sha256" in records.source
-    if not is_complete or len(records.shape) != 3:
+    image = records.source.get("image")
+    is_whole = "weights_sha256" in records.source and len(records.shape) == 3
+    if not isinstance(image, dict) or not is_whole:
         raise DataError(f"{records.folder / _DESCRIPTION}: not embeddings of images")
     wanted = embedding_fields(image_config or image)
     if lines := files.differences(image, wanted, "config.model.image"):
@@ -228,11 +228,12 @@ def open_embeddings(
     return records
 
 
-def embedding_fields(image_config: Mapping[str, Any]) -> dict[str, Any]:
+def embedding_fields(image_config: files.JsonObject) -> files.JsonObject:
     """Returns the part of `config.model.image` that embeddings depend on, in JSON types."""
     irrelevant = ("freeze", "attention", "layer_scale")
-    plain = {k: v for k, v in image_config.items() if k not in irrelevant}
-    return json.loads(json.dumps(plain))
+    relevant = {k: v for k, v in image_config.items() if k not in irrelevant}
+    plain: files.JsonObject = json.loads(json.dumps(relevant))
+    return plain
 
 
 def describe_grid(grid: RadarGrid) -> str:
@@ -288,7 +289,7 @@ class PreprocessReport:
 
 
 def preprocess(
-    frames: LabelledFrames,
+    frames: LabelledFrames[LabelledFrame],
     folder: files.PathLike,
     *,
     dtype: str | None = None,
@@ -324,7 +325,7 @@ def preprocess(
     index, count = shard
     require(0 <= index < count, "shard", shard, "(i, n) with i from 0 to n - 1")
     grid = frames.grid
-    source: dict[str, Any] = {"grid": grid.to_dict()}
+    source: files.JsonObject = {"grid": grid.to_dict()}
     if frames.reader_version is not None:
         name = f"{type(frames).__module__}:{type(frames).__qualname__}"
         source["reader"] = [name, frames.reader_version]
@@ -347,7 +348,7 @@ def preprocess(
     return PreprocessReport(len(mine), num_found, skipped, time.perf_counter() - began)
 
 
-def _file_of(frame: LabelledFrame) -> list[Any] | None:
+def _file_of(frame: LabelledFrame) -> list[str | int] | None:
     """Returns name, size and modification time of a frame's radar file, if it exists."""
     if frame.radar_path is None or not frame.radar_path.exists():
         return None

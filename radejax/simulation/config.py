@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import pydantic
 from annotated_types import Ge, Le
@@ -38,7 +38,7 @@ CONDITIONS = (
     ("mountain", "day", "fog"),
 )
 
-PRESETS: dict[str, dict[str, Any]] = {
+PRESETS: dict[str, dict[str, object]] = {
     "ideal": {},
     "realistic": {
         "gain_db": (206.0, 210.0),
@@ -111,7 +111,7 @@ class RadarOptions(Options, section="config.simulation.radar"):
         return RadarParameters(**{"ranges": ranges} | fields | lowest)
 
 
-FULL_SIZE: dict[str, Any] = {
+FULL_SIZE: dict[str, object] = {
     "grid": "kradar",
     "radar": RadarOptions(),
     "image_width": 1280,
@@ -181,7 +181,7 @@ class SimulationOptions(Options, section="config.simulation"):
 
     @pydantic.field_validator("grid", mode="before")
     @classmethod
-    def _of_form(cls, grid: Any) -> Any:
+    def _of_form(cls, grid: object) -> object:
         if isinstance(grid, Mapping):
             return (AxesGrid if "range_m" in grid else ReducedGrid)(**grid)
         expected = "'kradar', or arguments of RadarGrid.reduced or RadarGrid"

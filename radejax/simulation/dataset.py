@@ -14,11 +14,10 @@ import functools
 import itertools
 import json
 import logging
-import os
 import pathlib
 import pickle
 from collections.abc import Callable, Generator, Iterator
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import numpy as np
@@ -53,7 +52,7 @@ _log = logging.getLogger(__name__)
 
 def simulate_dataset(
     options: SimulationOptions,
-    root: str | os.PathLike,
+    root: files.PathLike,
     *,
     num_workers: int | None = None,
     progress: bool = True,
@@ -132,7 +131,7 @@ def _is_finished(root: pathlib.Path, options: SimulationOptions) -> bool:
     return files.read_object(marker, "finished")["finished"] is True
 
 
-def _marker(options: SimulationOptions) -> dict[str, Any]:
+def _marker(options: SimulationOptions) -> files.JsonObject:
     """Returns the content of the marker file of an unfinished dataset."""
     return {
         "config": json.loads(options.to_json()),
@@ -147,7 +146,9 @@ class Writer:
     def __init__(
         self, root: pathlib.Path, options: SimulationOptions, source: SceneSource
     ) -> None:
-        self.root, self.options, self.source = root, options, source
+        self.root = root
+        self.options = options
+        self.source = source
 
     def write_common(self) -> list[FrameSpec]:
         """Writes everything but frames, and returns the frames without a label file."""
@@ -175,7 +176,9 @@ class Writer:
                 files.write_text(path, calibration.to_kradar_text())
         return missing
 
-    def write_frames(self, missing: list[FrameSpec], num_workers: int, bar) -> None:
+    def write_frames(
+        self, missing: list[FrameSpec], num_workers: int, bar: tqdm
+    ) -> None:
         """Writes the missing frames, and advances a progress bar."""
         compute = functools.partial(
             tensor.simulate,
@@ -223,7 +226,9 @@ class Writer:
         return given, simulator.labels(frame, given)
 
     @functools.cached_property
-    def _sequence(self) -> Callable[[int], tuple[SequenceSimulator, Any]]:
+    def _sequence(
+        self,
+    ) -> Callable[[int], tuple[SequenceSimulator, CameraRenderer | None]]:
         """Function that makes simulator and renderer by sequence number, with a cache."""
         return functools.lru_cache(maxsize=2)(self._make)
 
@@ -264,7 +269,7 @@ def _started_ahead(items: Iterator[_T], count: int) -> Iterator[_T]:
         yield waiting.popleft()
 
 
-_writer: Any = None
+_writer: Writer
 
 
 def _start_worker(writer: Writer) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Sequence
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -48,7 +47,7 @@ _MAX_ELEMENTS = 128
 
 def fit_files(
     recordings: Sequence[files.PathLike], out: files.PathLike
-) -> dict[str, Any]:
+) -> files.JsonObject:
     """Estimate the parameters of a radar, and draw a recording beside a simulated frame.
 
     Args:
@@ -89,10 +88,12 @@ def fit_files(
 
 
 def _mean_db(power: Tensor) -> Float[np.ndarray, "R A"]:
-    return 10.0 * np.log10(power.mean((0, 2), dtype=np.float64) + 1e-10)
+    mean = power.mean((0, 2), dtype=np.float64) + 1e-10
+    level: Float[np.ndarray, "R A"] = 10.0 * np.log10(mean)
+    return level
 
 
-def _simulated(section: dict[str, Any]) -> Tensor:
+def _simulated(section: files.JsonObject) -> Tensor:
     """Simulates the tensor of one procedural frame."""
     options = SimulationOptions(**section, train_sequences=1, frames_per_sequence=1)
     simulator = SequenceSimulator(make_source(options).make(1), options)
@@ -100,7 +101,7 @@ def _simulated(section: dict[str, Any]) -> Tensor:
     return simulator.run(given, "tesseract")
 
 
-def fit_radar(recordings: Iterable[Tensor], grid: RadarGrid) -> dict[str, Any]:
+def fit_radar(recordings: Iterable[Tensor], grid: RadarGrid) -> files.JsonObject:
     """Estimate the fields of `simulation.radar` from recorded radar tensors.
 
     Args:
@@ -121,7 +122,7 @@ def fit_radar(recordings: Iterable[Tensor], grid: RadarGrid) -> dict[str, Any]:
     found = [_fit_one(np.asarray(power, np.float32), grid) for power in recordings]
     if not found:
         raise DataError("no recordings to estimate the parameters of the radar from")
-    fields: dict[str, Any] = {"preset": "realistic", "receiver_db": 0.0}
+    fields: files.JsonObject = {"preset": "realistic", "receiver_db": 0.0}
     fields |= {"range_profile": 1.0, "array_pedestal": ARRAY_PEDESTAL}
     for name in dict.fromkeys(itertools.chain.from_iterable(found)):
         values = np.array([fit[name] for fit in found if name in fit])
@@ -131,7 +132,7 @@ def fit_radar(recordings: Iterable[Tensor], grid: RadarGrid) -> dict[str, Any]:
     return fields
 
 
-def _fit_one(power: Tensor, grid: RadarGrid) -> dict[str, Any]:
+def _fit_one(power: Tensor, grid: RadarGrid) -> files.JsonObject:
     line = power.mean((2, 3), dtype=np.float64)  # [D, R]
     # A tenth of the cells, which have a known share of the mean: few of them hold echoes.
     base = np.quantile(power, 0.1, axis=(0, 2, 3)) / -np.log(0.9)  # [R]
@@ -152,7 +153,7 @@ def _fit_one(power: Tensor, grid: RadarGrid) -> dict[str, Any]:
     # Not relative to the mean of each line, which has few independent cells.
     mean = (line * quiet).sum(0) / np.maximum(quiet.sum(0), 1)
     excess = power / np.where(mean > 0.0, mean, 1.0)[:, None, None] - 1.0
-    fit: dict[str, Any] = {"noise_db": 10.0 * np.log10(noise)}
+    fit: files.JsonObject = {"noise_db": 10.0 * np.log10(noise)}
     fit["profile_db"] = _profile(power, base / noise, noise, grid)
     both = quiet[:, 1:] & quiet[:, :-1]
     correlation = _correlation(excess[:, 1:][both], excess[:, :-1][both])

@@ -7,7 +7,7 @@ them. It creates the scene of each sequence on request, procedurally or from lab
 from __future__ import annotations
 
 import collections
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt32
@@ -50,7 +50,7 @@ class RadarInput(NamedTuple):
     lit: Float[np.ndarray, " N"]
 
     @property
-    def arrays(self) -> tuple[Any, ...]:
+    def arrays(self) -> tuple[object, ...]:
         """The arrays from which `tensor.simulate` computes the frame."""
         return self.scatterers, self.noise_power, self.key, self.state
 
@@ -68,8 +68,10 @@ class SequenceSimulator:
     """
 
     def __init__(self, sequence: Sequence, options: SimulationOptions) -> None:
-        self.sequence, self.options = sequence, options
-        self.grid, self.parameters = options.make_grid(), options.make_parameters()
+        self.sequence = sequence
+        self.options = options
+        self.grid = options.make_grid()
+        self.parameters = options.make_parameters()
         rng = np.random.default_rng([options.seed, sequence.name, 11])
         tracks = sequence.tracks
         sizes_m = np.median(tracks.size_m, axis=0)
@@ -134,8 +136,10 @@ class SequenceSimulator:
         These are in the field of view, have an SNR above `MIN_SNR_DB`, and more than
         `MIN_LIT` of their power is not blocked by other boxes.
         """
-        inside = self.grid.in_field_of_view(frame.boxes[:, 0], frame.boxes[:, 1])
-        return inside & (given.snr_db > MIN_SNR_DB) & (given.lit > MIN_LIT)
+        visible: np.ndarray = self.grid.in_field_of_view(*frame.boxes[:, :2].T)
+        visible &= given.snr_db > MIN_SNR_DB
+        visible &= given.lit > MIN_LIT
+        return visible
 
     def labels(self, frame: SceneFrame, given: RadarInput) -> list[Label]:
         """Returns the labels of one frame in the LiDAR frame, as in K-Radar's files."""
@@ -147,8 +151,9 @@ class SequenceSimulator:
             box = frame.boxes[n].copy()
             box[:3] -= self.options.radar_from_lidar_m
             track = frame.track[n]
-            cls, track_id = tracks.label_cls[track], int(tracks.track_id[track])
+            cls = tracks.label_cls[track]
             visibility = "R" if visible[n] else "L"
+            track_id = int(tracks.track_id[track])
             labels.append(Label(cls, tuple(box.tolist()), visibility, track_id))
         return labels
 

@@ -38,9 +38,8 @@ ROI_COLOR = "black"
 LIDAR_COLOR = "#ffa64d"
 # The color-blind safe palette of Okabe and Ito, with a yellow that is visible on paper.
 SERIES_COLORS = (
-    *("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9"),
-    *("#000000", "#8A6D00"),
-)
+    "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8A6D00",
+)  # fmt: skip
 
 
 class Style(NamedTuple):

@@ -14,7 +14,7 @@ from tabulate import tabulate
 from tqdm import tqdm
 
 from radejax.core.errors import DataError, UserError
-from radejax.core.files import PathLike
+from radejax.core.files import JsonObject, PathLike
 from radejax.core.structures import CLASSES, RARE_SHARE
 from radejax.data.dataset import Summary
 from radejax.data.kradar.conditions import KRADAR_CONDITIONS, UNKNOWN_CONDITIONS
@@ -23,7 +23,7 @@ from radejax.data.kradar.folders import SequenceFolder, read_calibration
 from radejax.data.kradar.tesseract import check_frame
 from radejax.geometry.radar_grid import RadarGrid
 
-Rows = list[dict[str, Any]]
+Rows = list[JsonObject]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +51,7 @@ class HealthReport:
         """Number of missing or malformed items."""
         return len(self.summary.problems)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Returns the report as JSON values."""
         summary = {"num_problems": self.num_problems, **self.summary.to_dict()}
         return {**vars(self), "summary": summary}
@@ -76,7 +76,7 @@ class HealthReport:
         return "\n\n".join(part for part in parts if part)
 
 
-def _with_shares(row: Mapping[str, Any]) -> dict[str, str]:
+def _with_shares(row: JsonObject) -> dict[str, str]:
     """Formats one row of `objects` as text with the share of every class."""
     total = max(sum(row[cls] for cls in CLASSES), 1)
     cells = {}
@@ -167,7 +167,7 @@ def _row(
     folder: SequenceFolder,
     frames: Sequence[Frame],
     splits: Mapping[str, str],
-) -> dict[str, Any]:
+) -> JsonObject:
     """Returns the table row of one sequence."""
     conditions = KRADAR_CONDITIONS.get(number, UNKNOWN_CONDITIONS)._asdict()
     calibration = "unknown"

@@ -381,7 +381,7 @@ def _read_sequence(index: Index, number: int, summary: Summary) -> _Sequence:
 
 
 def _read_or_report(
-    read: Callable[[Any], T], path: LabelPath | None, kind: str, summary: Summary
+    read: Callable[[PathLike], T], path: PathLike | None, kind: str, summary: Summary
 ) -> T | None:
     """Returns the content of a file, or None if it is missing or malformed.
 
@@ -402,9 +402,10 @@ def _read_label_files(
     counts = summary.counts
     lines = []
     for key in keys:
-        path = index.label_paths[key]
-        file = _read_or_report(index.read_labels, path, "label file", summary)
-        if file is None:
+        try:
+            file = index.read_labels(index.label_paths[key])
+        except DataError as error:
+            summary.report("label file", str(error))
             continue
         files[key] = file
         lines += file.problems

@@ -15,11 +15,12 @@ import pathlib
 import re
 import zipfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
+from radejax.core import files
 from radejax.core.archives import wrap_read_errors
 from radejax.core.errors import DataError, UserError
-from radejax.core.files import PathLike, as_path, find_files, read_json, read_text
+from radejax.core.files import PathLike
 from radejax.core.structures import frame_key
 from radejax.data.kradar.labels import Key, LabelPath
 from radejax.data.kradar.reduced import RELEASES, UNUSABLE_POINTS
@@ -50,12 +51,12 @@ class SequenceFolder:
 
     def _list(self, subfolder: str) -> dict[str, pathlib.Path]:
         """Returns the files of a subfolder by name; the first root takes precedence."""
-        files: dict[str, pathlib.Path] = {}
+        found: dict[str, pathlib.Path] = {}
         for folder in self.folders:
             with contextlib.suppress(FileNotFoundError, NotADirectoryError):
                 for name in sorted(os.listdir(folder / subfolder)):
-                    files.setdefault(name, folder / subfolder / name)
-        return files
+                    found.setdefault(name, folder / subfolder / name)
+        return found
 
     def find(self, subfolder: str, name: str) -> pathlib.Path | None:
         """Returns the path of a file, or None if no root has it."""
@@ -71,7 +72,7 @@ def as_paths(paths: PathLike | Iterable[PathLike] | None) -> list[pathlib.Path]:
         return []
     if isinstance(paths, str | os.PathLike):
         paths = [paths]
-    return [as_path(path) for path in paths]
+    return [files.as_path(path) for path in paths]
 
 
 def sequence_number(folder: pathlib.Path) -> int | None:
@@ -144,7 +145,7 @@ def read_calibration(path: PathLike) -> tuple[int, float, float]:
     Raises:
         DataError: The file is malformed; the message names file and line.
     """
-    line = "".join(read_text(path).splitlines()[1:2])
+    line = "".join(files.read_text(path).splitlines()[1:2])
     with contextlib.suppress(ValueError):
         difference, dx_m, dy_m = map(float, line.split(","))
         is_near = abs(dx_m) <= _MAX_OFFSET_M and abs(dy_m) <= _MAX_OFFSET_M
@@ -157,7 +158,7 @@ def read_calibration(path: PathLike) -> tuple[int, float, float]:
 
 
 def _read_common(
-    folders: Sequence[pathlib.Path], name: str, read: Callable[[Any], T]
+    folders: Sequence[pathlib.Path], name: str, read: Callable[[files.JsonObject], T]
 ) -> T | None:
     """Reads the JSON files of one name in all folders; returns None if there are none.
 
@@ -168,7 +169,7 @@ def _read_common(
     for path in (folder / name for folder in folders):
         if path.is_file():
             with wrap_read_errors(path, "the description of a sensor"):
-                found[path] = read(read_json(path))
+                found[path] = read(files.read_json(path))
     if len(set(found.values())) > 1:
         raise DataError(
             f"{' and '.join(map(str, found))} differ; datasets of different sensors "
@@ -261,16 +262,16 @@ def find_labels(path: pathlib.Path) -> dict[Key, LabelPath]:
         UserError: There are no label files in it.
         DataError: It contains a frame twice, or the zip file is corrupted.
     """
-    files: list[tuple[str, LabelPath]]
+    members: list[tuple[str, LabelPath]]
     if path.is_dir():
-        paths = find_files(path, "*.txt")
-        files = [(file.relative_to(path).as_posix(), file) for file in paths]
+        paths = files.find_files(path, "*.txt")
+        members = [(file.relative_to(path).as_posix(), file) for file in paths]
     else:
         with wrap_read_errors(path, "a folder or a zip file of labels"):
             archive = zipfile.ZipFile(path)  # stays open while its members are used
-        files = [(name, zipfile.Path(archive, name)) for name in archive.namelist()]
+        members = [(name, zipfile.Path(archive, name)) for name in archive.namelist()]
     found: dict[Key, LabelPath] = {}
-    for place, file in files:
+    for place, file in members:
         *folders, name = place.replace("\\", "/").split("/")
         matches = map(_LABELLED_SEQUENCE.fullmatch, reversed(folders))
         sequence = next(filter(None, matches), None)
@@ -294,7 +295,7 @@ def read_split(path: PathLike) -> list[Key]:
         DataError: A line is malformed; the message names file and line.
     """
     frames = []
-    for number, line in enumerate(read_text(path).splitlines(), start=1):
+    for number, line in enumerate(files.read_text(path).splitlines(), start=1):
         if match := _SPLIT_LINE.fullmatch(line):
             frames.append((int(match[1]), frame_key(match[2])))
         elif line.strip():

@@ -17,9 +17,9 @@ from radejax.geometry.radar_grid import RadarGrid
 _MAX_HEADER_LINES = 20
 
 POINT_FIELDS = (
-    *("x", "y", "z", "power", "doppler", "range", "azimuth", "elevation"),
-    *("range_bin", "azimuth_bin", "elevation_bin"),
-)
+    "x", "y", "z", "power", "doppler", "range", "azimuth", "elevation",
+    "range_bin", "azimuth_bin", "elevation_bin",
+)  # fmt: skip
 """Columns of points in files, in the units of K-Radar's `rpc` files."""
 
 
@@ -107,7 +107,8 @@ def read_lidar(path: PathLike) -> Float[np.ndarray, "N 3"]:
             name, _, header[name] = line.strip().partition(" ")
             if name == "DATA":
                 break
-        fields, kind = header.get("FIELDS", "none"), header.get("DATA", "none")
+        fields = header.get("FIELDS", "none")
+        kind = header.get("DATA", "none")
         if fields.split()[:3] != ["x", "y", "z"] or kind != "ascii":
             raise DataError(
                 f"{path}: PCD header with FIELDS {fields[:80]} and DATA {kind[:80]}, "

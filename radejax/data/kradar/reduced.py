@@ -23,7 +23,7 @@ References:
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float, Int, Real
@@ -41,6 +41,8 @@ UNUSABLE_POINTS = (
     "networks need; download rdr_polar_3d or rpc files instead"
 )
 
+Indices = Int[np.ndarray, " N"]
+
 POWER_UNIT = 1e13
 """Released powers are linear power divided by this."""
 
@@ -51,7 +53,8 @@ EMPTY_LEVEL = 0.5
 """Level of bins without a point, a little below K-Radar's noise."""
 
 _MAX_POWER = 1e6  # far above any echo divided by POWER_UNIT, far below undivided noise
-_MIN_DECIBELS, _MAX_DECIBELS = 60.0, 300.0  # undivided noise is above, echoes are below
+_MIN_DECIBELS = 60.0  # undivided noise is above
+_MAX_DECIBELS = 300.0  # echoes are below
 
 _KRADAR_DOPPLER_MPS = np.linspace(-1.932591218305504, 1.872197742733457, 64)
 """K-Radar's Doppler axis, of which `RadarGrid.kradar` has six decimals."""
@@ -125,15 +128,14 @@ def project_reduced(
     check_layout(frame, grid, name)
     projection = np.empty(grid.projection_shape, np.float32)
     if frame.ndim == 2:
-        bins: Any = _bins_of_points(frame, grid, name)
+        bins = _bins_of_points(frame, grid, name)
         beams = bins[0][None] * grid.num_azimuth + bins[1]
         cells = frame.T[3:5, None]
         rows = grid.num_range
     else:
-        # So few rows at a time stay in the cache.
-        bins = ...
+        bins = ()  # the index of all cells
         cells = frame
-        rows = 16
+        rows = 16  # so few at a time stay in the cache
         beams = np.arange(rows * grid.num_azimuth).reshape(rows, -1, 1)
     _check_power(cells[0], name)
     if grid.num_doppler:
@@ -232,7 +234,7 @@ def _with_direction(frame: Real[np.ndarray, "..."]) -> Real[np.ndarray, "..."]:
 
 
 def points_of_bins(
-    bins: tuple[Int[np.ndarray, " N"], ...],
+    bins: tuple[Indices, ...],
     power: Float[np.ndarray, " N"],
     doppler_mps: Float[np.ndarray, " N"],
     grid: RadarGrid,
@@ -254,11 +256,12 @@ def points_of_bins(
 
 
 def _points_at(
-    bins: Any, grid: RadarGrid, is_axis_up: bool = False
+    bins: Sequence[Indices] | np.ndarray, grid: RadarGrid, is_axis_up: bool = False
 ) -> Float[np.ndarray, "6 N"]:
     """Returns x, y, z, range, azimuth and elevation of bins, in the signs of points."""
     r = grid.range_m[bins[0]]
-    azimuth, elevation = -grid.azimuth_rad[bins[1]], np.zeros(r.shape)
+    azimuth = -grid.azimuth_rad[bins[1]]
+    elevation = np.zeros(r.shape)
     if grid.num_elevation:
         elevation = grid.elevation_rad[bins[2]] * (1 if is_axis_up else -1)
     ground = r * np.cos(elevation)
@@ -268,7 +271,7 @@ def _points_at(
 
 def _bins_of_points(
     points: Float[np.ndarray, "N _"], grid: RadarGrid, name: str
-) -> tuple[Int[np.ndarray, " N"], ...]:
+) -> tuple[Indices, ...]:
     """Returns range, azimuth and elevation bins, from their columns or from x, y, z."""
     x, y, z = xyz = points[:, :3].T
     axes = grid.range_m, grid.azimuth_rad, grid.elevation_rad
@@ -311,7 +314,8 @@ def check_layout(frame: Real[np.ndarray, "..."], grid: RadarGrid, name: str) -> 
 
 def _check_power(power: Float[np.ndarray, "..."], name: str) -> None:
     """Raises a `DataError` if powers are not on the scale of the releases."""
-    low, high = float(power.min()), float(power.max())
+    low = float(power.min())
+    high = float(power.max())
     share = 0.0 if low else np.mean(power == 0)
     # Powers of all cells differ by more than a factor of 2, logarithms of them by less.
     is_whole = power.ndim == 3 and power.size > 1_000

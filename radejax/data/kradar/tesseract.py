@@ -161,8 +161,9 @@ def read_frame(path: PathLike, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
         DataError: The file is corrupted or has another shape than the grid.
     """
     if pathlib.Path(path).suffix != ".npy":
-        projection = project_file(path, shape_drea=grid.shape_drea)
-        return grid.measured_channels(projection)
+        whole = project_file(path, shape_drea=grid.shape_drea)
+        projection: np.ndarray = grid.measured_channels(whole)
+        return projection
     if reduced.is_reduced_file(path):
         return reduced.project_reduced(read_npy(path, mapped=True), grid, str(path))
     projection = read_projection_npy(path, projection_shape=grid.projection_shape)
@@ -273,8 +274,11 @@ def _read_columns(
 
 # MATLAB v5 files --------------------------------------------------------------------
 
-_MATRIX, _DEFLATED = 14, 15
-_INT8, _INT32, _UINT32 = 1, 5, 6
+_INT8 = 1
+_INT32 = 5
+_UINT32 = 6
+_MATRIX = 14
+_DEFLATED = 15
 # Types of arrays and types of stored values, by their numbers in the format.
 _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4"}
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8"}

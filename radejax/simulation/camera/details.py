@@ -17,6 +17,8 @@ from radejax.simulation.world.scene import REFLECTOR_KINDS, SceneFrame
 
 Quads = Float[np.ndarray, "F 4 3"]
 Spans = Float[np.ndarray, "F 2"]
+Span = tuple[float, float]
+Color = tuple[float, float, float]
 
 FRONT, REAR, LEFT, RIGHT, TOP = range(5)
 """Indices of the faces of a block, in the order of `shapes`."""
@@ -36,9 +38,9 @@ class Detail(NamedTuple):
 
     block: int
     face: int
-    u: tuple[float, float]
-    v: tuple[float, float]
-    color: tuple[float, float, float]
+    u: Span
+    v: Span
+    color: Color
 
 
 _GLASS = (44.0, 54.0, 68.0)
@@ -51,21 +53,18 @@ _DARK = (36.0, 38.0, 42.0)
 _HAIR = (48.0, 38.0, 32.0)
 
 
-def _pair(block, face, u, v, color, other=None) -> list[Detail]:
-    """Returns a detail and its mirror image on the same face or on face `other`."""
-    opposite = face if other is None else other
+def _pair(block: int, face: int, u: Span, v: Span, color: Color) -> list[Detail]:
+    """Returns a detail and its mirror image, which is on the right for the left face."""
+    opposite = RIGHT if face == LEFT else face
     mirrored = Detail(block, opposite, (1.0 - u[1], 1.0 - u[0]), v, color)
     return [Detail(block, face, u, v, color), mirrored]
 
 
-def _sides(block, u, v, color) -> list[Detail]:
-    """Returns a detail on both sides of a block, with u from the rear to the front."""
-    return _pair(block, LEFT, u, v, color, RIGHT)
-
-
-def _wheel(block, center, half_u, low, high) -> list[Detail]:
+def _wheel(block: int, center: float, half_u: float, whole_v: Span) -> list[Detail]:
     """Returns wheels on both sides: two overlapping rectangles each, and one for the rim."""
-    middle, half_v = (low + high) / 2.0, (high - low) / 2.0
+    low, high = whole_v
+    middle = (low + high) / 2.0
+    half_v = (high - low) / 2.0
     result = []
     for share_u, share_v, color in (
         (1.0, 0.55, _TYRE),
@@ -74,55 +73,55 @@ def _wheel(block, center, half_u, low, high) -> list[Detail]:
     ):
         u = (center - half_u * share_u, center + half_u * share_u)
         v = (middle - half_v * share_v, middle + half_v * share_v)
-        result += _sides(block, u, v, color)
+        result += _pair(block, LEFT, u, v, color)
     return result
 
 
 DETAILS: dict[str, tuple[Detail, ...]] = {
     "Sedan": (
-        *_wheel(1, 0.19, 0.072, -0.333, 0.56),
-        *_wheel(1, 0.82, 0.072, -0.333, 0.56),
+        *_wheel(1, 0.19, 0.072, (-0.333, 0.56)),
+        *_wheel(1, 0.82, 0.072, (-0.333, 0.56)),
         *_pair(1, FRONT, (0.04, 0.26), (0.5, 0.76), _LAMP),
         *_pair(1, REAR, (0.03, 0.22), (0.5, 0.8), _RED),
         Detail(1, FRONT, (0.32, 0.68), (0.4, 0.7), _DARK),
         Detail(1, FRONT, (0.38, 0.62), (0.1, 0.28), _PLATE),
         Detail(1, REAR, (0.36, 0.64), (0.48, 0.7), _PLATE),
-        *_sides(2, (0.08, 0.49), (0.12, 0.84), _GLASS),
-        *_sides(2, (0.53, 0.92), (0.12, 0.84), _GLASS),
+        *_pair(2, LEFT, (0.08, 0.49), (0.12, 0.84), _GLASS),
+        *_pair(2, LEFT, (0.53, 0.92), (0.12, 0.84), _GLASS),
         Detail(2, FRONT, (0.06, 0.94), (0.06, 0.9), _GLASS),
         Detail(2, REAR, (0.07, 0.93), (0.1, 0.86), _GLASS),
     ),
     "Bus or Truck": (
-        *_wheel(1, 0.16, 0.07, -0.12, 0.22),
-        *_wheel(1, 0.34, 0.07, -0.12, 0.22),
-        *_wheel(2, 0.5, 0.33, -0.155, 0.28),
-        *_sides(1, (0.02, 0.98), (0.5, 0.58), _PLATE),
+        *_wheel(1, 0.16, 0.07, (-0.12, 0.22)),
+        *_wheel(1, 0.34, 0.07, (-0.12, 0.22)),
+        *_wheel(2, 0.5, 0.33, (-0.155, 0.28)),
+        *_pair(1, LEFT, (0.02, 0.98), (0.5, 0.58), _PLATE),
         *_pair(1, REAR, (0.04, 0.14), (0.06, 0.14), _RED),
         Detail(1, REAR, (0.4, 0.6), (0.06, 0.12), _PLATE),
         Detail(1, REAR, (0.49, 0.51), (0.18, 0.96), _DARK),
         Detail(2, FRONT, (0.06, 0.94), (0.52, 0.93), _GLASS),
         *_pair(2, FRONT, (0.05, 0.2), (0.1, 0.2), _LAMP),
         Detail(2, FRONT, (0.4, 0.6), (0.06, 0.15), _PLATE),
-        *_sides(2, (0.3, 0.85), (0.52, 0.9), _GLASS),
+        *_pair(2, LEFT, (0.3, 0.85), (0.52, 0.9), _GLASS),
     ),
     "Pedestrian": (
         Detail(3, REAR, (0.0, 1.0), (0.15, 1.0), _HAIR),
-        *_sides(3, (0.0, 1.0), (0.55, 1.0), _HAIR),
+        *_pair(3, LEFT, (0.0, 1.0), (0.55, 1.0), _HAIR),
         Detail(3, FRONT, (0.0, 1.0), (0.75, 1.0), _HAIR),
         Detail(3, TOP, (0.0, 1.0), (0.0, 1.0), _HAIR),
         *_pair(2, FRONT, (0.0, 0.16), (0.1, 0.95), _DARK),
         *_pair(2, REAR, (0.0, 0.16), (0.1, 0.95), _DARK),
     ),
     "Motorcycle": (
-        *_sides(0, (0.3, 0.7), (0.3, 0.7), _RIM),
-        *_sides(1, (0.3, 0.7), (0.3, 0.7), _RIM),
+        *_pair(0, LEFT, (0.3, 0.7), (0.3, 0.7), _RIM),
+        *_pair(1, LEFT, (0.3, 0.7), (0.3, 0.7), _RIM),
         Detail(2, FRONT, (0.3, 0.7), (0.45, 0.95), _LAMP),
         Detail(2, REAR, (0.3, 0.7), (0.6, 0.9), _RED),
         Detail(2, REAR, (0.3, 0.7), (0.2, 0.5), _PLATE),
     ),
     "Bicycle": (
-        *_sides(0, (0.25, 0.75), (0.25, 0.75), _RIM),
-        *_sides(1, (0.25, 0.75), (0.25, 0.75), _RIM),
+        *_pair(0, LEFT, (0.25, 0.75), (0.25, 0.75), _RIM),
+        *_pair(1, LEFT, (0.25, 0.75), (0.25, 0.75), _RIM),
         Detail(4, REAR, (0.0, 1.0), (0.2, 1.0), _HAIR),
         Detail(4, TOP, (0.0, 1.0), (0.0, 1.0), _HAIR),
     ),
@@ -142,7 +141,8 @@ def on_faces(faces: Quads, u: Spans, v: Spans) -> Quads:
     """
     u, v = u[:, [0, 1, 1, 0], None], v[:, [0, 0, 1, 1], None]  # [F, 4, 1]
     a, b, c, d = (faces[:, None, i] for i in range(4))
-    return (1 - v) * ((1 - u) * a + u * b) + v * ((1 - u) * d + u * c)
+    corners: Quads = (1 - v) * ((1 - u) * a + u * b) + v * ((1 - u) * d + u * c)
+    return corners
 
 
 _FACADES = np.array(
@@ -184,7 +184,8 @@ def make_panels(
     """
     fixed = frame.reflectors
     near = np.hypot(fixed.position_m[:, 0], fixed.position_m[:, 1]) < _FAR_M
-    panels, colors = [], []
+    panels = []
+    colors = []
     for name, half_width, low, high, palette in (
         ("tree", 0.15, 0.0, 2.2, np.array([(74.0, 60.0, 46.0)])),
         ("tree", 1.5, 2.0, 6.0, _TREES),
@@ -201,8 +202,8 @@ def make_panels(
         side = half_width * np.stack([np.cos(angle), np.sin(angle)], 1)
         a, b = position[:, :2] - side, position[:, :2] + side
         z = np.broadcast_to([ground_m + low, ground_m + high], a.shape)
-        flat, height = np.stack([a, b, b, a], 1), z[:, [0, 0, 1, 1], None]
-        panels.append(np.concatenate([flat, height], -1))
+        flat = np.stack([a, b, b, a], 1)
+        panels.append(np.concatenate([flat, z[:, [0, 0, 1, 1], None]], -1))
         color = palette[frame.reflector_idx[chosen] * 7919 % len(palette)]
         if name in ("tree", "pole"):
             color = color + white * 0.6 * (_SNOWY - color)

@@ -116,7 +116,7 @@ def _blurred(image: Image.Image, factor: float) -> Image.Image:
     return smaller.resize(image.size, Image.Resampling.BICUBIC)
 
 
-def _drop_mask(size, share: float, rng: Generator) -> Image.Image:
+def _drop_mask(size: tuple[int, int], share: float, rng: Generator) -> Image.Image:
     """Draws a mask of soft round patches that cover about a fraction of the image."""
     width, height = 160, 90
     mask = Image.new("L", (width, height), 0)

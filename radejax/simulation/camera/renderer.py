@@ -86,8 +86,8 @@ class Ground(NamedTuple):
 def trace_ground(calibration: CameraCalibration, ground_m: float) -> Ground:
     """Intersects the ray of every pixel with the plane `z = ground_m` (radar frame)."""
     fx, fy, cx, cy = calibration.intrinsics
-    columns, rows = np.arange(calibration.width), np.arange(calibration.height)
-    u, v = np.meshgrid(columns + 0.5, rows + 0.5)
+    columns = np.arange(calibration.width) + 0.5
+    u, v = np.meshgrid(columns, np.arange(calibration.height) + 0.5)
     seen = np.stack([(u - cx) / fx, (v - cy) / fy], -1)
     ideal = undistort(seen, calibration.distortion)
     rays = np.concatenate([ideal, np.ones_like(u)[..., None]], -1)
@@ -130,7 +130,8 @@ class CameraRenderer:
     """
 
     def __init__(self, sequence: Sequence, options: SimulationOptions) -> None:
-        self.sequence, self.options = sequence, options
+        self.sequence = sequence
+        self.options = options
         self.calibrations = calibrations = stereo_calibration(options)
         self.grounds = [trace_ground(c, sequence.ground_m) for c in calibrations]
         rng = np.random.default_rng([options.seed, sequence.name, 7])
@@ -154,20 +155,20 @@ class CameraRenderer:
         """Renders the image of the left (0) or right (1) camera."""
         if self.options.camera_mode == "oracle":
             return self.silhouettes(frame, side)
-        calibration = self.calibrations[side]
         canvas = Image.fromarray(self._background(frame, self.grounds[side]))
         draw = ImageDraw.Draw(canvas)
         for polygon in self.polygons(frame, side):
             draw.polygon(polygon.points, fill=polygon.color)
         if self.light.headlights:
-            self._lamps(frame, calibration, draw)
-        seed, name, index = self.options.seed, self.sequence.name, frame.index
+            self._lamps(frame, side, draw)
+        seed = self.options.seed
+        name = self.sequence.name
         brightness = 0.45 if self.light.headlights else 1.0
-        rng = np.random.default_rng([seed, name, side, index, 5])
+        rng = np.random.default_rng([seed, name, side, frame.index, 5])
         canvas = lens.add_precipitation(canvas, self.air, brightness, rng)
         if self.options.cover_lens:
-            weather, block = self.sequence.weather, index // lens.BLOCK_FRAMES
-            level = lens.cover_level(seed, name, index, weather)
+            level = lens.cover_level(seed, name, frame.index, self.sequence.weather)
+            block = frame.index // lens.BLOCK_FRAMES
             rng = np.random.default_rng([seed, name, side, block, 6])
             canvas = lens.cover_lens(canvas, level, self.air.is_snow, brightness, rng)
         return np.asarray(canvas)
@@ -210,8 +211,9 @@ class CameraRenderer:
         colors = self.colors[frame.track]
         return shapes.visible_polygons(frame, colors, calibration, self.light, roadside)
 
-    def _lamps(self, frame, calibration, draw) -> None:
+    def _lamps(self, frame: SceneFrame, side: int, draw: ImageDraw.ImageDraw) -> None:
         """Draws the visible headlights and rear lights of vehicles at night."""
+        calibration = self.calibrations[side]
         vehicles = np.flatnonzero(np.isin(frame.cls, _WITH_LAMPS))
         x, y, z, length, width, height, yaw = frame.boxes[np.repeat(vehicles, 2)].T
         is_front = rotate(x, y, -yaw)[0] < 0  # the front faces the radar
@@ -243,8 +245,9 @@ class CameraRenderer:
         self, frame: SceneFrame, ground: Ground
     ) -> Float[np.ndarray, "P 3"]:
         """Computes the colors of the pixels that show ground."""
-        sequence, lanes = self.sequence, self.sequence.lanes_m
-        x, y, depth = ground.x_m, ground.y_m, ground.depth_m
+        sequence = self.sequence
+        lanes = sequence.lanes_m
+        x, y = ground.x_m, ground.y_m
         verge = _VERGE.get(sequence.environment, _GRASS)
         verge = verge + self.air.white * (_SNOW - verge)
         left = y - 0.5 * sequence.road.curvature_per_m * x * x
@@ -260,14 +263,14 @@ class CameraRenderer:
         surface = asphalt + snow * (_SNOW - asphalt)
         color = np.where(on_road[:, None], surface, color)
         dashed = np.mod(along, 12.0) < 5.0
-        width = 0.09 + depth * 0.0012  # at least a pixel far away
+        width = 0.09 + ground.depth_m * 0.0012  # at least a pixel far away
         on_line = np.zeros(x.size, bool)
         for border in lanes:
             is_edge = border in (min(lanes), max(lanes))
             on_line |= (np.abs(left - border) < width) & (dashed | is_edge)
         paint = _MARKING * (1.0 - 0.5 * self.air.white)
         color = np.where(on_line[:, None], paint + self.air.white * 100.0, color)
-        return self.light.apply(color, x, y, depth)
+        return self.light.apply(color, x, y, ground.depth_m)
 
 
 def _hash_noise(i: Values, j: Values) -> Values:

@@ -20,6 +20,7 @@ _Block = tuple[_Pair, _Pair, _Pair, str, _Pair]
 
 Colors = Float[np.ndarray, "N 3"]
 Lengths = Float[np.ndarray, " N"]
+Point = Float[np.ndarray, "3"]
 
 _STRAIGHT = (1.0, 1.0)
 BLOCKS: dict[str, tuple[_Block, ...]] = {
@@ -143,7 +144,8 @@ class Light(NamedTuple):
             beam = np.exp(-np.square(y_m / (2.0 + 0.16 * np.abs(x_m))))
             brightness = brightness + 0.75 * beam * np.exp(-np.abs(x_m) / 28.0)
         clear = np.exp(-self.extinction_per_m * depth_m)[..., None]
-        return color * brightness[..., None] * clear + self.veil * (1.0 - clear)
+        lit: Colors = color * brightness[..., None] * clear + self.veil * (1.0 - clear)
+        return lit
 
 
 def visible_polygons(
@@ -174,18 +176,22 @@ def visible_polygons(
     return [Polygon(*row) for row in zip(*columns, strict=True) if row[0]]
 
 
-def camera_position(calibration: CameraCalibration) -> Float[np.ndarray, "3"]:
+def camera_position(calibration: CameraCalibration) -> Point:
     """Returns the position of the camera in the radar frame."""
     to_ego = calibration.rotation.T
-    return calibration.radar_from_lidar_m - to_ego @ calibration.translation_m
+    origin: Point = calibration.radar_from_lidar_m - to_ego @ calibration.translation_m
+    return origin
 
 
-def _object_faces(frame: SceneFrame, colors, origin) -> Faces:
+def _object_faces(
+    frame: SceneFrame, colors: Float[np.ndarray, "N 2 3"], origin: Point
+) -> Faces:
     """Returns the faces of the objects that are turned toward the camera.
 
     Objects with their center more than 3 m behind the radar are left out.
     """
-    flat, vector = np.zeros(0), np.zeros((0, 3))
+    flat = np.zeros(0)
+    vector = np.zeros((0, 3))
     parts = [(np.zeros((0, 4, 3)), vector, flat, flat, flat.astype(int), vector)]
     for index in np.flatnonzero(frame.boxes[:, 0] > -3.0):
         box = frame.boxes[index]
@@ -203,12 +209,15 @@ def _object_faces(frame: SceneFrame, colors, origin) -> Faces:
             on_block, on_face, u, v, paint = _DETAIL_TABLES[cls]
             chosen = quads[on_block * len(_NORMALS) + on_face]
             quads = np.concatenate([quads, details.on_faces(chosen, u, v)])
-            block, face = np.r_[block, on_block], np.r_[face, on_face]
+            block = np.r_[block, on_block]
+            face = np.r_[face, on_face]
             color = np.concatenate([color, paint])
         block_depth = np.linalg.norm(corners.mean(1) - origin, axis=1)[block]
-        same = np.full(len(quads), depth), np.full(len(quads), index)
-        normal = _NORMALS[face] @ turn.T
-        parts.append((quads, color, same[0], block_depth, same[1], normal))
+        depths = np.full(len(quads), depth)
+        boxes = np.full(len(quads), index)
+        parts.append(
+            (quads, color, depths, block_depth, boxes, _NORMALS[face] @ turn.T)
+        )
     *columns, normal = map(np.concatenate, zip(*parts, strict=True))
     faces = Faces(*columns)
     sunlit = 0.62 + 0.38 * np.maximum(normal @ _SUN, 0.0)
@@ -230,14 +239,14 @@ def _project_faces(faces: Quads, calibration: CameraCalibration) -> list[list[fl
     outlines = outlines.reshape(len(faces), -1, 3)
     size = np.array([calibration.width, calibration.height], float)
     places, depth = project(outlines, camera)
-    nearest, farthest = depth.min(1), depth.max(1)
+    is_cut = depth.min(1) < _NEAR_M
     result: list[list[float]] = [[] for _ in faces]
     shown = ((places.max(1) >= 0) & (places.min(1) <= size)).all(1)
     # Flat lists of only the visible faces: creating tuples would take as long as drawing.
-    whole = np.flatnonzero(shown & ~(nearest < _NEAR_M))
+    whole = np.flatnonzero(shown & ~is_cut)
     for index, points in zip(whole, _flat(places[whole], size), strict=True):
         result[index] = points
-    for index in np.flatnonzero((nearest < _NEAR_M) & (farthest >= _NEAR_M)):
+    for index in np.flatnonzero(is_cut & (depth.max(1) >= _NEAR_M)):
         cut = project(_cut_near(outlines[index], depth[index], _NEAR_M), camera)[0]
         if (cut.max(0) >= 0).all() and (cut.min(0) <= size).all():
             result[index] = _flat(cut[None], size)[0]
@@ -249,11 +258,14 @@ def _flat(
 ) -> list[list[float]]:
     """Returns the pixels of faces as flat lists, clipped to the vicinity of the image."""
     near = np.clip(places, -2.0 * size, 3.0 * size)
-    return near.reshape(len(near), 2 * near.shape[1]).tolist()
+    pixels: list[list[float]] = near.reshape(len(near), 2 * near.shape[1]).tolist()
+    return pixels
 
 
-def _cut_near(outline, depth, near_m) -> np.ndarray:
-    """Clips a polygon `[P, 3]` at a depth by the Sutherland-Hodgman algorithm."""
+def _cut_near(
+    outline: Float[np.ndarray, "P 3"], depth: Float[np.ndarray, " P"], near_m: float
+) -> Float[np.ndarray, "Q 3"]:
+    """Clips a polygon at a depth by the Sutherland-Hodgman algorithm."""
     kept = []
     for i in range(len(outline)):
         here, there = depth[i - 1], depth[i]

@@ -32,7 +32,7 @@ References:
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Complex, Float, Inexact
@@ -98,7 +98,8 @@ def attenuation(weather: str, distance_m: Cells) -> Cells:
     """Computes the factor on the received power by two-way attenuation and radome loss."""
     law = WEATHERS[weather]
     loss_db = 2.0 * law.attenuation_db_per_km * distance_m / 1000.0 + law.radome_db
-    return 10.0 ** (-loss_db / 10.0)
+    factor: Cells = 10.0 ** (-loss_db / 10.0)
+    return factor
 
 
 def noise_profile(
@@ -136,7 +137,8 @@ def noise_profile(
     of_rain = _doppler_share(-speed, law.spread_mps, grid)
     of_ground = _doppler_share(-speed * np.cos(grid.azimuth_rad), None, grid)
     noise = sensor.receiver_noise(grid, parameters)
-    noise = noise + rain[:, None] * of_rain + ground[:, None] * of_ground
+    noise += rain[:, None] * of_rain
+    noise += ground[:, None] * of_ground
     return noise.astype(np.float32)
 
 
@@ -159,12 +161,13 @@ def _doppler_share(
     offset = np.mod(offset + period / 2, period) - period / 2
     spread = (offset[..., None] + folds) / (spread_mps or step / 2.0)
     density = np.exp(-0.5 * spread**2).sum(-1)
-    return (density / density.sum(-1, keepdims=True)).mean(0)
+    share: Float[np.ndarray, " D"] = (density / density.sum(-1, keepdims=True)).mean(0)
+    return share
 
 
 def reflection(
-    sine: float | Float[np.ndarray, "*targets"], surface: Surface, wavelength_m: float
-) -> Inexact[Any, "*targets"]:
+    sine: Float[np.ndarray, "*targets"], surface: Surface, wavelength_m: float
+) -> Inexact[np.ndarray, "*targets"]:
     """Computes the complex reflection coefficient of the coherent field.
 
     The polarization is horizontal.
@@ -174,11 +177,12 @@ def reflection(
         surface: Reflecting surface.
         wavelength_m: Wavelength.
     """
-    sine = np.asarray(sine, float)
     root = np.sqrt(surface.permittivity - (1.0 - sine**2))
-    fresnel = (sine - root) / (sine + root)
     rough = 2.0 * np.pi * surface.roughness_m * sine / wavelength_m
-    return fresnel * np.exp(-2.0 * rough**2)
+    coherent: Inexact[np.ndarray, "*targets"] = (
+        (sine - root) / (sine + root) * np.exp(-2.0 * rough**2)
+    )
+    return coherent
 
 
 def bounce(
@@ -204,4 +208,5 @@ def bounce(
     bounced = np.maximum(np.hypot(flat, height + radar_height), 1e-6)
     rho = reflection((height + radar_height) / bounced, surface, wavelength_m)
     turn = 2.0 * np.pi * (bounced - direct) / wavelength_m
-    return np.square(1.0 + rho * np.exp(1j * turn))
+    factor: Complex[np.ndarray, " S"] = np.square(1.0 + rho * np.exp(1j * turn))
+    return factor

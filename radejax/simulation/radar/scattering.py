@@ -121,7 +121,8 @@ def make_object_scatterers(
         Scattering centers of all objects, ordered by object. The cross-section of an
         object, averaged over aspects, is the mean of its class times a log-normal factor.
     """
-    flat, vector = np.zeros(0), np.zeros((0, 3))
+    flat = np.zeros(0)
+    vector = np.zeros((0, 3))
     none = ObjectScatterers(flat.astype(int), vector, vector, *[flat] * 5)
     objects = enumerate(zip(cls, size_m, strict=True))
     parts = (_one_object(i, CLASSES[c], size, rng) for i, (c, size) in objects)
@@ -258,7 +259,8 @@ def received_power(
     pattern = forward**parameters.pattern_exponent
     gain = 10.0 ** ((parameters.gain_db + parameters.receiver_db) / 10.0)
     passed = sensor.high_pass(distance, parameters.high_pass_m)
-    return gain * rcs_m2 * pattern / distance**4 * passed
+    power: Values = gain * rcs_m2 * pattern / distance**4 * passed
+    return power
 
 
 CAPACITY_STEP = 512
@@ -283,24 +285,26 @@ def to_scatterers(
         the object moves, so adjacent scatterers of an object add up in some frames and
         cancel in others.
     """
-    position, amplitude = found.position_m, np.sqrt(found.power)
+    position = found.position_m
     velocity = found.velocity_mps - ego_velocity_mps
     distance = np.maximum(np.linalg.norm(position, axis=1), 1e-3)
     way = np.mod(4.0 * np.pi * distance / wavelength_m, 2 * np.pi)
     phase = found.phase_rad + way
+    amplitude = np.sqrt(found.power)
     missing = -len(distance) % CAPACITY_STEP if len(distance) else CAPACITY_STEP
-
-    def padded(*columns: Values) -> Float[np.ndarray, "K P"]:
-        return np.pad(columns, ((0, 0), (0, missing))).astype(np.float32)
-
-    range_m, azimuth_rad, elevation_rad, velocity_mps = padded(
+    columns = (
         distance,
         -np.arctan2(position[:, 1], position[:, 0]),
         np.arcsin(np.clip(position[:, 2] / distance, -1.0, 1.0)),
         (velocity * position[:, :2]).sum(1) / distance,
+        amplitude * np.cos(phase),
+        amplitude * np.sin(phase),
     )
-    parts = padded(amplitude * np.cos(phase), amplitude * np.sin(phase))
-    return Scatterers(range_m, azimuth_rad, elevation_rad, velocity_mps, parts.T)
+    padded = np.pad(columns, ((0, 0), (0, missing))).astype(np.float32)
+    range_m, azimuth_rad, elevation_rad, velocity_mps = padded[:4]
+    return Scatterers(
+        range_m, azimuth_rad, elevation_rad, velocity_mps, amplitude=padded[4:].T
+    )
 
 
 def scatter_surroundings(
@@ -358,7 +362,8 @@ def scatter_ghosts(
     is_near = np.hypot(forward, left) < _MIRROR_REACH_M
     is_on_our_side = np.sign(planes)[:, None] * (planes[:, None] - left) > 0
     mirror, chosen = np.nonzero(is_near & is_on_our_side)  # of [mirrors, S]
-    plane, position = planes[mirror], objects.position_m[chosen]
+    plane = planes[mirror]
+    position = objects.position_m[chosen]
     direct = np.linalg.norm(position, axis=1)
     position[:, 1] = 2.0 * plane - position[:, 1]
     mirrored = np.linalg.norm(position, axis=1)

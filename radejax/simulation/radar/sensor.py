@@ -58,8 +58,11 @@ def receiver_noise(
     is_still = np.zeros(max(grid.num_doppler, 1))
     is_still[np.abs(grid.doppler_mps).argmin() if grid.num_doppler else 0] = 1.0
     leak = np.maximum(factor - 1.0, 0.0) * is_still.size
-    power = 10.0 ** ((parameters.noise_db + parameters.receiver_db) / 10.0)
-    return power * (np.minimum(factor, 1.0)[:, None] + leak[:, None] * is_still)
+    level = 10.0 ** ((parameters.noise_db + parameters.receiver_db) / 10.0)
+    power: Float[np.ndarray, "R D"] = level * (
+        np.minimum(factor, 1.0)[:, None] + leak[:, None] * is_still
+    )
+    return power
 
 
 def high_pass(

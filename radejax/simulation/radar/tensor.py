@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import functools
 import itertools
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import jax
 import jax.numpy as jnp
@@ -104,8 +104,6 @@ class RadarParameters(Options, section="config.simulation.radar"):
     """Taper of the array, from 0 (Hann window) to 1 (uniform window)."""
     doppler_pedestal: Fraction = 0.0
     """Window of the Doppler axis, likewise."""
-    range_resolution_m: Annotated[float, Ge(0), Le(100)] = 0.0
-    """Width of a range bin of the FFT, or 0 for the grid's bins."""
     pattern_exponent: Annotated[float, Ge(0), Le(100)] = 3.0
     """Exponent of the two-way antenna gain `cos(angle) ** exponent`."""
     max_scatterers_per_row: Annotated[int, Ge(1), Le(4096)] = 96
@@ -132,12 +130,11 @@ class RadarParameters(Options, section="config.simulation.radar"):
 
         They are drawn uniformly from their ranges.
         """
-        drawn: dict[str, Any] = {n: rng.uniform(a, b) for n, a, b in self.ranges}
+        drawn = {name: rng.uniform(low, high) for name, low, high in self.ranges}
         if self.gain_doppler_bins:
             share = max(num_doppler, 1) / self.gain_doppler_bins
             drawn["gain_db"] = drawn.get("gain_db", self.gain_db) + 10 * np.log10(share)
-        changes = {"ranges": (), "gain_doppler_bins": 0, **drawn}
-        return self.replace(**changes)
+        return self.replace(ranges=(), gain_doppler_bins=0, **drawn)
 
 
 IDEAL = RadarParameters()
@@ -234,15 +231,11 @@ def doppler_response(
 
 
 def range_response(
-    range_m: PerTarget,
-    grid: RadarGrid,
-    parameters: RadarParameters,
-    pedestal: Pedestal = 0.0,
+    range_m: PerTarget, grid: RadarGrid, pedestal: Pedestal
 ) -> Float[jax.Array, "R S"]:
     """Computes amplitudes on the range axis."""
-    resolution = parameters.range_resolution_m or grid.range_widths_m
     axis = grid.range_m.astype(np.float32)[:, None]
-    offset = (axis - range_m[None]) / np.reshape(resolution, (-1, 1))
+    offset = (axis - range_m[None]) / np.reshape(grid.range_widths_m, (-1, 1))
     return window_response(offset, pedestal)
 
 
@@ -278,26 +271,28 @@ def simulate(
     """
     pedestal = parameters.array_pedestal
     elevation_rad = grid.elevation_rad if grid.num_elevation else np.zeros(1)
-    m, n = parameters.elevation_elements, parameters.azimuth_elements
+    m = parameters.elevation_elements
+    n = parameters.azimuth_elements
     elevation_basis = array_basis(elevation_rad, m, pedestal)
     azimuth_basis = array_basis(grid.azimuth_rad, n, pedestal)
     up: Phases = None
     across: Phases = None
     of_range: Pedestal = 0.0
     if state is not None:
-        up, across = state.elevation_phase_rad, state.azimuth_phase_rad
+        up = state.elevation_phase_rad
+        across = state.azimuth_phase_rad
         azimuth_basis = azimuth_basis * state.beam_gain[:, None]
         of_range = state.range_pedestal
     elevation = array_signal(scatterers.elevation_rad, m, pedestal, up)  # [M, S]
     azimuth = array_signal(scatterers.azimuth_rad, n, pedestal, across)  # [N, S]
     window = parameters.doppler_pedestal
     doppler = doppler_response(scatterers.velocity_mps, grid, window)  # [D, S]
-    in_range = range_response(scatterers.range_m, grid, parameters, of_range)  # [R, S]
+    in_range = range_response(scatterers.range_m, grid, of_range)  # [R, S]
     magnitude = jnp.linalg.norm(scatterers.amplitude, axis=-1)
     num_kept = min(parameters.max_scatterers_per_row, magnitude.shape[0])
     _, kept = lax.top_k(jnp.abs(in_range) * magnitude[None], num_kept)  # [R, K]
 
-    def row(inputs):
+    def row(inputs: tuple[jax.Array, ...]) -> Float[jax.Array, "..."]:
         index, weight, noise, row_idx = inputs
         amplitude = scatterers.amplitude[index] * weight[index][:, None]  # [K, 2]
         left = doppler[:, None, index] * elevation[None, :, index]
@@ -315,13 +310,15 @@ def simulate(
             return power
         maxima = jnp.concatenate([power.max(axis=0), power.max(axis=1)], axis=0).T
         levels = (10.0 * jnp.log10(maxima + POWER_FLOOR) + LOG_OFFSET_DB) / LOG_SCALE_DB
-        return grid.measured_channels(levels)  # [A, D+E]
+        measured: jax.Array = grid.measured_channels(levels)  # [A, D+E]
+        return measured
 
-    rows = (kept, in_range, noise_power, jnp.arange(grid.num_range, dtype=jnp.uint32))
-
-    one_by_one = functools.partial(lax.map, row)
-    in_batches = functools.partial(lax.map, row, batch_size=64)
-    return lax.platform_dependent(rows, cpu=one_by_one, default=in_batches)
+    rows: Float[jax.Array, "..."] = lax.platform_dependent(
+        (kept, in_range, noise_power, jnp.arange(grid.num_range, dtype=jnp.uint32)),
+        cpu=functools.partial(lax.map, row),
+        default=functools.partial(lax.map, row, batch_size=64),
+    )
+    return rows
 
 
 def array_basis(
@@ -340,7 +337,8 @@ def array_basis(
     turn = np.pi * np.sin(axis_rad)[:, None] * place
     sine = (weight * np.sin(turn))[:, place > 0]
     basis = np.concatenate([weight * np.cos(turn), sine], axis=1)
-    return (basis / np.linalg.norm(basis, axis=1, keepdims=True)).astype(np.float32)
+    basis /= np.linalg.norm(basis, axis=1, keepdims=True)
+    return basis.astype(np.float32)
 
 
 def array_signal(
@@ -364,7 +362,7 @@ def array_signal(
     count = np.where(place > 0, 1.0, np.sqrt(0.5))  # the middle element has no partner
     gain = np.linalg.norm(weight) / np.sum(weight * count)
     scale = np.concatenate([count, count[place > 0]]) * gain
-    signal = scale.astype(np.float32)[:, None] * both
+    signal: jax.Array = scale.astype(np.float32)[:, None] * both
     if phase_rad is not None:
         coherent = weight * count / np.sum(weight * count)
         signal = signal / jnp.sum(coherent * jnp.cos(phase_rad))
@@ -415,7 +413,8 @@ def _noise(
     side = 0.5 * (1.0 - pedestal) / (1.0 + pedestal)
     window = one + side * (np.roll(one, 1, axis=0) + np.roll(one, -1, axis=0))
     window = window / np.linalg.norm(window, axis=1, keepdims=True)
-    return (jnp.sqrt(power)[:, None] * window) @ white.reshape(num_doppler, -1)
+    scale: jax.Array = jnp.sqrt(power)[:, None] * window
+    return scale @ white.reshape(num_doppler, -1)
 
 
 def _correlate(

@@ -5,8 +5,15 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from jaxtyping import Int
 
-from radejax.simulation.world.scene import REFLECTOR_KINDS, Reflectors, Road
+from radejax.simulation.world.scene import (
+    REFLECTOR_KINDS,
+    Broadcast,
+    Reflectors,
+    Road,
+    Values,
+)
 
 GROUND_M = -0.9
 """Height of the ground in the radar frame. K-Radar's radar is mounted at bumper height."""
@@ -102,6 +109,15 @@ ENVIRONMENTS = {
 }  # fmt: skip
 """K-Radar's eight road types."""
 
+# Mean and standard deviation of the radar cross-section of each kind of reflector in dBsm.
+_DBSM = {
+    "ground": (-24.0, 5.0),
+    "rail": (-9.0, 3.0),
+    "wall": (-7.0, 4.0),
+    "pole": (-5.0, 4.0),
+    "tree": (-5.0, 4.0),
+}
+
 
 def make_surroundings(
     law: Environment,
@@ -125,41 +141,36 @@ def make_surroundings(
         The reflectors in the world frame, and the lateral positions of the rails and
         walls, which mirror objects.
     """
-    parts: list[tuple] = []
+    parts: list[tuple[Values, Values, Values, Int[np.ndarray, " M"]]] = []
     mirrors: list[float] = []
 
-    def add(kind, along, left, height, dbsm, side=None) -> None:
+    def add(
+        kind: str, along: Values, left: Broadcast, up: Broadcast, side: float = np.nan
+    ) -> None:
         """Adds reflectors whose normal points left (1) or right (-1), or isotropic ones."""
         x, y, heading = road.position(along, left)
-        turn = np.nan if side is None else side * np.pi / 2.0
+        position = np.stack([x, y, np.broadcast_to(ground_m + up, x.shape)], 1)
+        dbsm = rng.normal(*_DBSM[kind], len(x))
         kinds = np.full(len(x), REFLECTOR_KINDS.index(kind))
-        position = np.stack([x, y, ground_m + height], 1)
-        parts.append((position, dbsm, heading + turn, kinds))
+        parts.append((position, dbsm, heading + side * np.pi / 2.0, kinds))
 
     right, left = edges
     count = int(length_m * 1.2)
-    add(
-        "ground", rng.uniform(0, length_m, count),
-        rng.uniform(right - 15.0, left + 15.0, count), np.zeros(count),
-        rng.normal(-24.0, 5.0, count),
-    )  # fmt: skip
+    along = rng.uniform(0, length_m, count)
+    add("ground", along, rng.uniform(right - 15.0, left + 15.0, count), 0.0)
     for side, edge in ((-1.0, right), (1.0, left)):
         if rng.random() < law.rails:
             along = np.arange(0.0, length_m, 2.0)  # posts
             mirrors.append(edge + side * 0.6)
-            dbsm = rng.normal(-9.0, 3.0, along.size)
-            add("rail", along, mirrors[-1], np.full(along.size, 0.6), dbsm, -side)
+            add("rail", along, mirrors[-1], 0.6, -side)
         if rng.random() < law.walls:
             along = rng.uniform(0.0, length_m, int(length_m * 0.8))
             along = along[np.sin(along / rng.uniform(6.0, 14.0)) > -0.6]  # gaps
             mirrors.append(edge + side * law.wall_m)
-            height = rng.uniform(0.2, 6.0, along.size)
-            dbsm = rng.normal(-7.0, 4.0, along.size)
-            add("wall", along, mirrors[-1], height, dbsm, -side)
+            add("wall", along, mirrors[-1], rng.uniform(0.2, 6.0, along.size), -side)
         count = rng.poisson(law.trees_per_100m * length_m / 100.0)
-        add(
-            "tree" if rng.random() < 0.5 else "pole", rng.uniform(0.0, length_m, count),
-            edge + side * rng.uniform(0.5, 6.0, count), rng.uniform(0.3, 3.0, count),
-            rng.normal(-5.0, 4.0, count),
-        )  # fmt: skip
+        kind = "tree" if rng.random() < 0.5 else "pole"
+        along = rng.uniform(0.0, length_m, count)
+        lateral = edge + side * rng.uniform(0.5, 6.0, count)
+        add(kind, along, lateral, rng.uniform(0.3, 3.0, count))
     return Reflectors(*map(np.concatenate, zip(*parts, strict=True))), tuple(mirrors)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import median_filter  # type: ignore[attr-defined]
 
-from radejax.data.kradar import Frame
+from radejax.data.kradar import Frame, Label
 from radejax.simulation.world import environments, scene
 from radejax.simulation.world.scene import Road, Sequence, Tracks
 
@@ -77,31 +77,31 @@ def collect_tracks(frames: list[Frame], radar_from_lidar_m: Shift) -> Tracks:
     with the id and class of an earlier label in the same frame, becomes a track of one
     frame.
     """
-    columns: dict[tuple, dict[int, tuple]] = {}
+    columns: dict[tuple[str | int, ...], dict[int, Label]] = {}
     for index, frame in enumerate(frames):
         for number, label in enumerate(frame.labels):
-            key: tuple = (label.cls, label.track_id)
+            key: tuple[str | int, ...] = (label.cls, label.track_id)
             if label.track_id < 0 or index in columns.get(key, {}):
                 key = (label.cls, label.track_id, index, number)
-            columns.setdefault(key, {})[index] = label.box
-    count, total = len(frames), len(columns)
-    boxes = np.zeros((count, total, 7))
-    present = np.zeros((count, total), bool)
+            columns.setdefault(key, {})[index] = label
+    first = [next(iter(track.values())) for track in columns.values()]
+    boxes = np.zeros((len(frames), len(columns), 7))
+    boxes[..., 3:6] = np.reshape([label.box for label in first], (-1, 7))[:, 3:6]
+    present = np.zeros(boxes.shape[:2], bool)
     for n, track in enumerate(columns.values()):
-        for index, box in track.items():
-            boxes[index, n], present[index, n] = box, True
-        first = next(iter(track.values()))
-        boxes[~present[:, n], n, 3:6] = first[3:6]
+        for index, label in track.items():
+            boxes[index, n] = label.box
+            present[index, n] = True
     boxes[..., :3] += radar_from_lidar_m
     return Tracks(
         position_m=boxes[..., :3],
         yaw_rad=boxes[..., 6],
-        velocity_mps=np.zeros((count, total, 2)),
+        velocity_mps=np.zeros((*present.shape, 2)),
         is_present=present,
         size_m=boxes[..., 3:6],
-        cls=np.array([scene.class_index(key[0]) for key in columns], int),
-        track_id=np.array([key[1] for key in columns], int),
-        label_cls=tuple(key[0] for key in columns),
+        cls=np.array([scene.class_index(label.cls) for label in first], int),
+        track_id=np.array([label.track_id for label in first], int),
+        label_cls=tuple(label.cls for label in first),
     )
 
 
@@ -136,7 +136,8 @@ def relative_velocity(
 
     def sum_of_three(values: np.ndarray) -> np.ndarray:
         padded = np.pad(values, ((1, 1), (0, 0), (0, 0)))
-        return padded[:-2] + padded[1:-1] + padded[2:]
+        total: np.ndarray = padded[:-2] + padded[1:-1] + padded[2:]
+        return total
 
     smooth = sum_of_three(velocity * weight) / np.maximum(sum_of_three(weight), 1.0)
     return np.where(weight > 0, smooth, 0.0)
@@ -162,7 +163,8 @@ def infer_ego_speed(
     known = lower > 0.3 * usual  # slow vehicles ahead are weak evidence
     speed = np.where(known, lower, usual)
     speed = np.clip(speed, 0.0, np.maximum(np.minimum(upper, 40.0), 0.0))
-    return median_filter(speed, 21, mode="nearest")
+    smooth: Float[np.ndarray, " F"] = median_filter(speed, 21, mode="nearest")
+    return smooth
 
 
 def _ground_height(tracks: Tracks) -> float:
@@ -187,5 +189,6 @@ def _road_edges(tracks: Tracks, law: environments.Environment) -> tuple[float, f
     left_edge = (law.lanes_left + 0.5) * law.lane_width_m + 1.0
     if left.size:
         low, high = np.percentile(left, (2.0, 98.0))
-        right_edge, left_edge = min(right_edge, low - 2.0), max(left_edge, high + 2.0)
+        right_edge = min(right_edge, low - 2.0)
+        left_edge = max(left_edge, high + 2.0)
     return right_edge, left_edge

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -24,7 +23,9 @@ Conditions = tuple[str, str, str]
 """Environment, time and weather."""
 
 PerFrame = Float[np.ndarray, " F"]
-Points = Float[np.ndarray, "N 3"]
+Values = Float[np.ndarray, "*all"]
+Broadcast = float | Float[np.ndarray, "..."]
+"""A value for all points, or an array that is broadcast to them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,19 +38,19 @@ class Road:
 
     curvature_per_m: float = 0.0
 
-    def position(self, along_m: Any, left_m: Any) -> tuple[Any, Any, Any]:
+    def position(
+        self, along_m: Values, left_m: Broadcast
+    ) -> tuple[Values, Values, Values]:
         """Returns world x, y and road heading at a point relative to the centerline.
 
         Args:
             along_m: Distance along the centerline.
             left_m: Distance to the left of the centerline.
         """
-        along_m = np.asarray(along_m, np.float64)
         k = self.curvature_per_m
         heading = k * along_m
-        if abs(k) < 1e-9:
-            x, y = along_m, np.zeros_like(along_m)
-        else:
+        x, y = along_m, np.zeros_like(along_m)
+        if abs(k) >= 1e-9:
             x, y = np.sin(heading) / k, (1.0 - np.cos(heading)) / k
         return x - left_m * np.sin(heading), y + left_m * np.cos(heading), heading
 
@@ -231,22 +232,23 @@ def is_blocked(
     leave = np.maximum(near, far).min(-1)
     crosses = (enter < leave) & (leave > 0) & (enter < 1.0) & (enter > 0)
     crosses &= np.arange(len(boxes))[None] != owner[:, None]
-    return crosses.any(1)
+    blocked: Bool[np.ndarray, " S"] = crosses.any(1)
+    return blocked
 
 
-def wrap_angle(angle_rad: Any) -> Any:
-    """Wraps an angle to [-pi, pi)."""
-    return np.mod(np.asarray(angle_rad) + np.pi, 2.0 * np.pi) - np.pi
+def wrap_angle(angle_rad: Values) -> Values:
+    """Wraps angles to [-pi, pi)."""
+    return (angle_rad + np.pi) % (2.0 * np.pi) - np.pi
 
 
-def rotate(x: Any, y: Any, angle_rad: Any) -> tuple[Any, Any]:
+def rotate(x: Values, y: Values, angle_rad: Broadcast) -> tuple[Values, Values]:
     """Rotates vectors in the ground plane counter-clockwise."""
     cos, sin = np.cos(angle_rad), np.sin(angle_rad)
     return cos * x - sin * y, sin * x + cos * y
 
 
 def turned(
-    vectors: Float[np.ndarray, "*all D"], angle_rad: Any
+    vectors: Float[np.ndarray, "*all D"], angle_rad: Broadcast
 ) -> Float[np.ndarray, "*all D"]:
     """Rotates vectors of two or three components counter-clockwise about the z axis."""
     x, y, *z = np.moveaxis(vectors, -1, 0)

@@ -7,12 +7,13 @@ time. All vehicles in a lane have the same speed, so the distances between them 
 from __future__ import annotations
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from radejax.simulation.world import environments, scene
-from radejax.simulation.world.scene import Road, Sequence, Tracks
+from radejax.simulation.world.scene import Broadcast, PerFrame, Road, Sequence, Tracks
 
 Size = Float[np.ndarray, "3"]
 
@@ -70,23 +71,35 @@ def make_sequence(
     )
 
 
+class _Path(NamedTuple):
+    """An object and its way; positions and speeds are one number or one per frame."""
+
+    cls: str
+    size: Size
+    along: Broadcast
+    left: Broadcast
+    speed: Broadcast
+    turn: float
+
+
 @dataclasses.dataclass
 class _Traffic:
     """Collects the objects of one sequence, each as a path along the road."""
 
     law: environments.Environment
     road: Road
-    clock: Float[np.ndarray, " F"]
-    ego_along: Float[np.ndarray, " F"]
-    ego_speed: Float[np.ndarray, " F"]
+    clock: PerFrame
+    ego_along: PerFrame
+    ego_speed: PerFrame
     rng: np.random.Generator
-    # (cls, size, along [F], left [F], speed [F], turn)
-    paths: list[tuple] = dataclasses.field(default_factory=list)
+    paths: list[_Path] = dataclasses.field(default_factory=list)
     lane_borders: tuple[float, ...] = ()
 
     def fill(self) -> tuple[float, float]:
         """Adds all objects and returns the right and left edge of the road."""
-        law, rng, width = self.law, self.rng, self.law.lane_width_m
+        law = self.law
+        rng = self.rng
+        width = law.lane_width_m
         stands = self.ego_speed.max() == 0.0  # on the shoulder
         lanes = range(-law.lanes_right, law.lanes_left + 1)
         for lane in lanes:
@@ -116,14 +129,10 @@ class _Traffic:
         self._cyclists(right + 0.5)
         return right - pavement - 1.0, left + pavement + 1.0
 
-    def _add(self, cls: str, size: Size, along, left, speed, turn: float) -> None:
-        """Adds an object whose positions and speeds are one number or one per frame."""
-        path = (np.broadcast_to(v, self.clock.shape) for v in (along, left, speed))
-        self.paths.append((cls, size, *path, turn))
-
     def _size(self, cls: str) -> Size:
-        mean, deviation = SIZES[cls]
-        return mean + np.array(deviation) * self.rng.normal(size=3).clip(-2, 2)
+        mean, deviation = np.array(SIZES[cls])
+        size: Size = mean + deviation * self.rng.normal(size=3).clip(-2, 2)
+        return size
 
     def _vehicle_class(self) -> str:
         law = self.law
@@ -132,7 +141,13 @@ class _Traffic:
             return "Bus or Truck"
         return "Motorcycle" if draw < law.trucks + law.two_wheelers else "Sedan"
 
-    def _lane(self, left_m, speed, direction, *, is_ego_lane=False) -> None:
+    def _lane(
+        self,
+        left_m: float,
+        speed: PerFrame,
+        direction: float,
+        is_ego_lane: bool = False,
+    ) -> None:
         """Adds the vehicles of one lane, with constant distances between them."""
         rng = self.rng
         way = scene.traveled(speed) * direction
@@ -142,14 +157,16 @@ class _Traffic:
         while along < last:
             cls = self._vehicle_class()
             size = self._size(cls)
-            rear, along = along, along + size[0] / 2.0
+            rear = along
+            along += size[0] / 2.0
             if not (is_ego_lane and (-8.0 < rear < 7.0 or -8.0 < along < 7.0)):
                 sway = 0.15 * np.sin(self.clock * 0.7 + rng.uniform(0, 6.3))
                 shift = rng.normal() * 0.2
                 if cls == "Motorcycle":
                     shift += rng.uniform(-0.8, 0.8)
                 turn = 0.0 if direction > 0 else np.pi
-                self._add(cls, size, along + way, left_m + shift + sway, speed, turn)
+                left = left_m + shift + sway
+                self.paths.append(_Path(cls, size, along + way, left, speed, turn))
             along += size[0] / 2.0 + 4.0 + rng.exponential(self.law.gap_m)
 
     def _parked(self, left_m: float, side: float) -> None:
@@ -160,14 +177,16 @@ class _Traffic:
             cls = "Bus or Truck" if rng.random() < 0.1 else "Sedan"
             size = self._size(cls)
             if self.law.perpendicular:
-                cls, size = "Sedan", self._size("Sedan")
-                turn, footprint = side * np.pi / 2, size[1]
+                cls = "Sedan"
+                size = self._size(cls)
+                turn = side * np.pi / 2
+                footprint = size[1]
             else:
                 turn = 0.0 if side < 0 or rng.random() < 0.3 else np.pi
                 footprint = size[0]
             turn += rng.normal() * 0.04 + (np.pi if rng.random() < 0.15 else 0.0)
             along += footprint / 2.0
-            self._add(cls, size, along, left_m, 0.0, turn)
+            self.paths.append(_Path(cls, size, along, left_m, 0.0, turn))
             spacing = 100.0 / self.law.parked_per_100m - footprint
             along += footprint / 2 + 0.7 + rng.exponential(max(spacing, 0.3))
 
@@ -189,7 +208,7 @@ class _Traffic:
                 left = rng.choice([right_m, left_m]) + rng.normal() * 0.4
                 turn = 0.0 if side > 0 else np.pi
                 along = along + side * walked
-            self._add("Pedestrian", size, along, left, pace, turn)
+            self.paths.append(_Path("Pedestrian", size, along, left, pace, turn))
 
     def _cyclists(self, left_m: float) -> None:
         """Adds bicycles along the right edge of the road."""
@@ -199,17 +218,21 @@ class _Traffic:
             pace = rng.uniform(3.0, 6.0)
             along = rng.uniform(8.0, length) + pace * self.clock
             left = left_m + rng.normal() * 0.2
-            self._add("Bicycle", self._size("Bicycle"), along, left, pace, 0.0)
+            size = self._size("Bicycle")
+            self.paths.append(_Path("Bicycle", size, along, left, pace, 0.0))
 
     def tracks(self) -> Tracks:
         """Returns all paths as boxes in the world frame, sorted by initial distance.
 
         There is at least one path, because every road type has oncoming traffic.
         """
-        paths = sorted(self.paths, key=lambda p: abs(p[2][0]))
-        cls, sizes, *path, turn = zip(*paths, strict=True)
+        paths = sorted(self.paths, key=lambda path: abs(np.ravel(path.along)[0]))
+        cls, sizes, *motion, turn = zip(*paths, strict=True)
         size = np.stack(sizes)
-        along, left, speed = (np.stack(v, 1) for v in path)  # [F, N]
+        along, left, speed = (
+            np.stack([np.broadcast_to(value, self.clock.shape) for value in column], 1)
+            for column in motion
+        )  # [F, N]
         x, y, heading = self.road.position(along, left)
         yaw = heading + np.array(turn)[None]
         distance = np.abs(along - self.ego_along[:, None])

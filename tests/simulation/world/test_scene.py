@@ -10,7 +10,7 @@ from radejax.simulation.world import scene
     ("angle", "expected"), [(np.pi, -np.pi), (3.5 * np.pi, -0.5 * np.pi), (0.3, 0.3)]
 )
 def test_wrap_angle(angle, expected):
-    assert scene.wrap_angle(angle) == pytest.approx(expected)
+    assert scene.wrap_angle(np.array([angle])) == pytest.approx([expected])
 
 
 def test_groups_count_as_their_single_class():

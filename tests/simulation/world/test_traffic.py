@@ -107,6 +107,6 @@ def test_road_is_a_circle_of_the_given_radius():
     x, y, heading = Road(0.01).position(np.array([0.0, 50.0, 100.0]), 0.0)
     np.testing.assert_allclose(np.hypot(x, y - 100.0), 100.0)
     np.testing.assert_allclose(heading, [0.0, 0.5, 1.0])
-    x, y, _ = Road(0.01).position(100.0, 2.0)
+    x, y, _ = Road(0.01).position(np.array([100.0]), 2.0)
     assert np.hypot(x, y - 100.0) == pytest.approx(98.0)
-    assert Road().position(7.0, 2.0)[:2] == (7.0, 2.0)
+    assert Road().position(np.array([7.0]), 2.0)[:2] == (7.0, 2.0)
