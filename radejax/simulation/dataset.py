@@ -45,6 +45,7 @@ _LABELS = "info_label_v2_1"
 _PNG_BYTES_PER_PIXEL = 0.3  # 0.13 to 0.47 measured
 _FEW_FRAMES = 100  # simulated before worker processes would have started
 
+_Simulators = tuple[SequenceSimulator, CameraRenderer | None]
 _T = TypeVar("_T")
 
 _log = logging.getLogger(__name__)
@@ -226,13 +227,11 @@ class Writer:
         return given, simulator.labels(frame, given)
 
     @functools.cached_property
-    def _sequence(
-        self,
-    ) -> Callable[[int], tuple[SequenceSimulator, CameraRenderer | None]]:
+    def _sequence(self) -> Callable[[int], _Simulators]:
         """Function that makes simulator and renderer by sequence number, with a cache."""
         return functools.lru_cache(maxsize=2)(self._make)
 
-    def _make(self, number: int) -> tuple[SequenceSimulator, CameraRenderer | None]:
+    def _make(self, number: int) -> _Simulators:
         sequence = self.source.make(number)
         is_shown = self.options.image_width > 0
         renderer = CameraRenderer(sequence, self.options) if is_shown else None

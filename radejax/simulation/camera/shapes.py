@@ -238,28 +238,21 @@ def _project_faces(faces: Quads, calibration: CameraCalibration) -> list[list[fl
     outlines = faces[:, :, None] + part * (following - faces)[:, :, None]
     outlines = outlines.reshape(len(faces), -1, 3)
     size = np.array([calibration.width, calibration.height], float)
+    vicinity = -2.0 * size, 3.0 * size
     places, depth = project(outlines, camera)
     is_cut = depth.min(1) < _NEAR_M
     result: list[list[float]] = [[] for _ in faces]
     shown = ((places.max(1) >= 0) & (places.min(1) <= size)).all(1)
     # Flat lists of only the visible faces: creating tuples would take as long as drawing.
     whole = np.flatnonzero(shown & ~is_cut)
-    for index, points in zip(whole, _flat(places[whole], size), strict=True):
+    flat = np.clip(places[whole], *vicinity).reshape(-1, 2 * places.shape[1]).tolist()
+    for index, points in zip(whole, flat, strict=True):
         result[index] = points
     for index in np.flatnonzero(is_cut & (depth.max(1) >= _NEAR_M)):
         cut = project(_cut_near(outlines[index], depth[index], _NEAR_M), camera)[0]
         if (cut.max(0) >= 0).all() and (cut.min(0) <= size).all():
-            result[index] = _flat(cut[None], size)[0]
+            result[index] = np.clip(cut, *vicinity).ravel().tolist()
     return result
-
-
-def _flat(
-    places: Float[np.ndarray, "F P 2"], size: Float[np.ndarray, "2"]
-) -> list[list[float]]:
-    """Returns the pixels of faces as flat lists, clipped to the vicinity of the image."""
-    near = np.clip(places, -2.0 * size, 3.0 * size)
-    pixels: list[list[float]] = near.reshape(len(near), 2 * near.shape[1]).tolist()
-    return pixels
 
 
 def _cut_near(
