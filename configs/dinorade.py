@@ -34,7 +34,6 @@ The weights of the image backbone are not part of a config; `train.py --image-ba
 """
 
 import pathlib
-from typing import Any
 
 from radejax.config import Config, load_module, parse_options
 from radejax.data.options import CameraOptions
@@ -42,7 +41,7 @@ from radejax.geometry.camera import KRADAR_RADAR_FROM_LIDAR_Z_M
 from radejax.models.lifting import OFFICIAL_OFFSET_M
 from radejax.models.options import DinoRadeOptions, QueryGridOptions, RadeNetOptions
 
-VARIANTS: dict[str, dict[str, Any]] = {
+VARIANTS: dict[str, dict[str, object]] = {
     "r": {},
     "rc": {"model.fusion.weighting": "off"},
     "rcw": {},

@@ -9,21 +9,17 @@ elevation bins, and images of 1280 x 720 pixels for the figures. Widths and sche
 Option `short`: a run of two minutes that tests the installation and hardly learns anything.
 """
 
-import pathlib
-
-from radejax.config import Config, load_module, parse_options
+from radejax.config import Config, load_config, parse_options
 from radejax.simulation.config import FULL_SIZE
 
 
 def get_config(arg: str | None = None) -> Config:
     """Return the complete config; `arg` is None or "short"."""
     (length,) = parse_options(arg, ("short",))
-    quickstart = load_module(pathlib.Path(__file__).with_name("quickstart.py"))
-    config = quickstart.get_config(",".join(filter(None, ("ablation", length))))
     frames = {"train_sequences": 800}
     if length == "short":
         frames = {"train_sequences": 2, "test_sequences": 1, "frames_per_sequence": 4}
-    return config.replace(
+    return load_config(f"quickstart:ablation,{length or ''}").replace(
         # A 4D tensor has 260 MB.
         simulation=FULL_SIZE | frames | {"output": "projection"},
         model={"doppler_bins": 64, "elevation_bins": 37},

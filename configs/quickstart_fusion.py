@@ -22,10 +22,7 @@ Options:
 - `short`: a run of two minutes that tests the installation and hardly learns anything.
 """
 
-import pathlib
-from typing import Any
-
-from radejax.config import Config, load_module, parse_options
+from radejax.config import Config, load_config, parse_options
 from radejax.data.options import CameraOptions
 from radejax.models.options import (
     DinoRadeOptions,
@@ -33,7 +30,6 @@ from radejax.models.options import (
     ImageOptions,
     QueryGridOptions,
 )
-from radejax.simulation.config import SimulationOptions
 
 
 def get_config(arg: str | None = None) -> Config:
@@ -42,8 +38,7 @@ def get_config(arg: str | None = None) -> Config:
         arg, ("radar",), ("silhouettes",), ("short", "long"), ("pretrained", "resnet50")
     )
     options = {None: "ablation", "short": "ablation,short", "long": ""}[length]
-    quickstart = load_module(pathlib.Path(__file__).with_name("quickstart.py"))
-    config = quickstart.get_config(options).replace(
+    config = load_config(f"quickstart:{options}").replace(
         simulation={
             "output": "projection",
             "image_width": 640,  # reduced in height, as objects stand side by side
@@ -53,9 +48,9 @@ def get_config(arg: str | None = None) -> Config:
         model={"input_stem": True},
     )
     if sensors != "radar":
-        config = _with_camera(config, config.simulation)
+        config = _with_camera(config)
         # Without `pretrained` or `resnet50`, the backbone is trained from scratch.
-        image: dict[str, Any] = {"freeze": backbone is not None}
+        image: dict[str, object] = {"freeze": backbone is not None}
         if backbone == "resnet50":
             # Half a million parameters, as many as the transformer.
             image |= {"kind": "resnet50", "resnet_width": 16}
@@ -71,8 +66,10 @@ def get_config(arg: str | None = None) -> Config:
     return config
 
 
-def _with_camera(config: Config, simulation: SimulationOptions) -> Config:
+def _with_camera(config: Config) -> Config:
     """Return a config of DinoRADE with the radar branch of another config."""
+    simulation = config.simulation
+    assert simulation is not None  # the quickstart simulates its data
     axes = QueryGridOptions.of_grid(simulation.make_grid())
     model = DinoRadeOptions(
         **dict(config.model) | {"name": "dinorade"},

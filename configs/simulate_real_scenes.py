@@ -8,17 +8,14 @@ becomes a simulated radar frame, with K-Radar's split. `docs/reports/2026-11-22_
 the expected numbers and those of a CFAR detector.
 """
 
-import pathlib
-
-from radejax.config import Config, load_module, parse_options
+from radejax.config import Config, load_config, parse_options
 from radejax.simulation.config import SimulationOptions
 
 
 def get_config(arg: str | None = None) -> Config:
     """Return the complete config; there are no variants."""
     parse_options(arg)
-    quickstart = load_module(pathlib.Path(__file__).with_name("quickstart.py"))
-    return quickstart.get_config("ablation").replace(
+    return load_config("quickstart:ablation").replace(
         simulation=SimulationOptions(
             scenes="labels_v2_1.zip",
             frame_stride=15,

@@ -2,7 +2,7 @@
 
 import importlib
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if sys.platform == "win32":
     raise ImportError("radejax runs on Linux and macOS; on Windows, use WSL 2")
@@ -35,9 +35,11 @@ if TYPE_CHECKING:  # the names for editors and type checkers
     from radejax.runs.data import data_of_run as data_of_run
     from radejax.runs.experiment import run as run
     from radejax.runs.figures import frame_scene as frame_scene
-    from radejax.simulation.dataset import simulate_dataset as simulate  # noqa: F401
+    from radejax.simulation.dataset import simulate_dataset
     from radejax.visualize.draw import draw_frame as draw_frame
     from radejax.visualize.style import Scene as Scene
+
+    simulate = simulate_dataset
 
 # On first use: reading labels or evaluating files should not load the models.
 _LAZY = {
@@ -76,7 +78,7 @@ def __dir__() -> list[str]:
     return [*globals(), *_LAZY]
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     if name in _LAZY:
         module, _, attribute = _LAZY[name].partition(":")
         return getattr(importlib.import_module(f"radejax.{module}"), attribute or name)

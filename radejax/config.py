@@ -21,7 +21,7 @@ from annotated_types import MinLen
 
 from radejax import models
 from radejax.core.errors import UserError, require
-from radejax.core.files import as_path
+from radejax.core.files import JsonObject, as_path
 from radejax.core.options import Options, Seed, as_tuples, did_you_mean
 from radejax.core.structures import CLASSES
 from radejax.data.dataset import find_reader
@@ -71,7 +71,7 @@ class Config(Options):
 
     @pydantic.field_validator("model", mode="before")
     @classmethod
-    def _of_named_class(cls, model: Any) -> Any:
+    def _of_named_class(cls, model: object) -> object:
         """Converts the model's options to the class of options of the named model."""
         if not isinstance(model, Mapping | RadeNetOptions):
             return model
@@ -85,9 +85,10 @@ class Config(Options):
             find_reader(self.data.format).check_options(self.data, self.classes)
         is_different = len(set(self.classes)) == len(self.classes)
         require(is_different, "config.classes", self.classes, "different classes")
-        name, count = "config.model.num_classes", self.model.num_classes
+        count = self.model.num_classes
         classes = f"{len(self.classes)}, the number of config.classes"
-        require(count == len(self.classes), name, count, classes)
+        is_equal = count == len(self.classes)
+        require(is_equal, "config.model.num_classes", count, classes)
         if self.train.evaluate_every_epochs:
             ious = self.evaluation.iou_thresholds
             known = [
@@ -114,9 +115,9 @@ class Config(Options):
         self.loss.find_terms()
         self.evaluation.find_protocols()
 
-    def without_data_paths(self) -> dict[str, Any]:
+    def without_data_paths(self) -> JsonObject:
         """Returns plain values for JSON with the data paths (`DATA_PATHS`) emptied."""
-        empty: dict[str, Any] = {**dict.fromkeys(DATA_PATHS), "roots": ()}
+        empty = {**dict.fromkeys(DATA_PATHS), "roots": ()}
         return self.replace(data=empty).model_dump(mode="json")
 
 
@@ -129,7 +130,8 @@ def check_bins(model: RadeNetOptions, grid: RadarGrid, source: str) -> None:
         source: Description of the radar for the error message.
     """
     for name in ("doppler", "elevation"):
-        bins, expected = getattr(model, f"{name}_bins"), getattr(grid, f"num_{name}")
+        bins = getattr(model, f"{name}_bins")
+        expected = getattr(grid, f"num_{name}")
         text = f"{expected}, as {source} has"
         require(bins == expected, f"config.model.{name}_bins", bins, text)
 
@@ -149,7 +151,7 @@ def load_config(path_and_options: str) -> Config:
     get_config = getattr(load_module(path), "get_config", None)
     if get_config is None:
         raise UserError(f"{path} has no function get_config()")
-    config = get_config(options) if options else get_config()
+    config: Config = get_config(options) if options else get_config()
     require(isinstance(config, Config), f"{path}: get_config()", config, "a Config")
     return config
 
@@ -244,7 +246,8 @@ def with_texts(config: Config, texts: Mapping[str, str]) -> Config:
     Raises:
         UserError: There is no such field, or the value is of another type.
     """
-    known, values = dict(config.fields()), {}
+    known = dict(config.fields())
+    values = {}
     for name, text in texts.items():
         if name not in known:
             hint = did_you_mean(name, known, "config.")
@@ -253,10 +256,10 @@ def with_texts(config: Config, texts: Mapping[str, str]) -> Config:
     return config.with_fields(values)
 
 
-def _read_text(config: Config, name: str, text: str) -> Any:
+def _read_text(config: Config, name: str, text: str) -> object:
     """Returns the first reading of a text that the type of a field allows."""
     *sections, field = name.split(".")
-    place: Any = config
+    place: object = config
     for section in sections:
         place = place[section] if isinstance(place, dict) else getattr(place, section)
     literal = _literal(text)
@@ -267,7 +270,7 @@ def _read_text(config: Config, name: str, text: str) -> Any:
     several = tuple(map(_literal, words))
     # The name has no effect: `Annotated` requires an annotation.
     kind: Any = Annotated[(info.annotation, field, *info.metadata)]
-    adapter = pydantic.TypeAdapter[Any](kind)
+    adapter = pydantic.TypeAdapter[object](kind)
     for reading in (as_tuples(literal), several, text):
         try:
             return adapter.validate_python(reading, strict=True)
@@ -277,7 +280,7 @@ def _read_text(config: Config, name: str, text: str) -> Any:
     return several if isinstance(getattr(place, field), tuple) else literal
 
 
-def _literal(text: str) -> Any:
+def _literal(text: str) -> object:
     """Returns the Python value that a text represents, or the text itself."""
     words = {"true": True, "false": False, "none": None}
     try:

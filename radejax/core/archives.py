@@ -70,7 +70,8 @@ def read_npy(path: PathLike, *, mapped: bool = False) -> np.ndarray:
     """
     with wrap_read_errors(path, "a NumPy array file"):
         array = np.load(as_path(path), mmap_mode="r", allow_pickle=False)
-        size, expected = as_path(path).stat().st_size, array.offset + array.nbytes
+        size = as_path(path).stat().st_size
+        expected = array.offset + array.nbytes
         if size != expected:
             raise DataError(f"{path}: corrupted, {size} bytes, expected {expected}")
         return array if mapped else np.array(array)

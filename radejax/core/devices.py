@@ -17,7 +17,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import jax
 import numpy as np
@@ -87,8 +87,11 @@ def put_batch(
 
 
 def state_sharding(
-    state: Any, mesh: Mesh, parameters: ParameterSharding, min_size: int = 2**16
-) -> Any:
+    state: PyTree[jax.Array | jax.ShapeDtypeStruct],
+    mesh: Mesh,
+    parameters: ParameterSharding,
+    min_size: int = 2**16,
+) -> PyTree[NamedSharding]:
     """Returns a pytree of `NamedSharding` with the placement of each array of a train state.
 
     Args:
@@ -101,7 +104,7 @@ def state_sharding(
     """
     size = mesh.devices.size
 
-    def place(x: Any) -> NamedSharding:
+    def place(x: jax.Array | jax.ShapeDtypeStruct) -> NamedSharding:
         axes = [a for a in range(len(x.shape)) if x.shape[a] % size == 0]
         is_small = np.prod(x.shape, dtype=int) < min_size
         if parameters == "replicated" or is_small or not axes:
@@ -146,7 +149,8 @@ def main_only(work: Callable[[], T]) -> T | None:
         error = failed
     # They wait at the coordinator and not in a collective, which would time out after
     # minutes.
-    client: Any = jax_distributed.global_state.client
+    client = jax_distributed.global_state.client
+    assert client is not None  # there are several processes
     client.wait_at_barrier(f"radejax {next(_numbers)}", timeout_in_ms=1000 * _WAIT_S)
     is_fine = all_agree(error is None)
     if error is not None:
@@ -171,7 +175,8 @@ def list_of_main(values: list[int]) -> list[int]:
     """
     count = int(multihost_utils.broadcast_one_to_all(np.int32(len(values))))
     own = values if is_main() else [0] * count
-    return multihost_utils.broadcast_one_to_all(np.asarray(own, np.int32)).tolist()
+    values = multihost_utils.broadcast_one_to_all(np.asarray(own, np.int32)).tolist()
+    return values
 
 
 @contextlib.contextmanager
@@ -203,7 +208,7 @@ def end_with_others() -> Iterator[None]:
     _send(_DONE, links)
 
 
-def _connect(state: Any, own: str) -> dict[str, socket.socket]:
+def _connect(state: jax_distributed.State, own: str) -> dict[str, socket.socket]:
     """Connects process 0 with all others.
 
     Args:
@@ -217,6 +222,8 @@ def _connect(state: Any, own: str) -> dict[str, socket.socket]:
         UserError: Process 0 cannot be reached.
     """
     key = "radejax/process 0"
+    assert state.client is not None  # `jax.distributed.initialize` sets both
+    assert state.coordinator_address is not None
     if state.process_id:
         host = state.coordinator_address.rpartition(":")[0].strip("[]")
         port, _, main = state.client.blocking_key_value_get(key, 300_000).partition(" ")
@@ -301,7 +308,8 @@ def stop_on_signal(mesh: Mesh) -> Iterator[Callable[[], bool]]:
     Args:
         mesh: Devices of all processes.
     """
-    event, before = threading.Event(), None
+    event = threading.Event()
+    before = None
     any_of = jax.jit(lambda x: x.any(), out_shardings=replicated(mesh))
 
     def handle(number: int, _: object) -> None:

@@ -91,7 +91,7 @@ def write_text(path: PathLike, text: str) -> None:
         file.write(text.encode("utf-8"))
 
 
-def write_json(path: PathLike, value: Any) -> None:
+def write_json(path: PathLike, value: object) -> None:
     """Writes plain values as JSON, atomically."""
     write_text(path, json.dumps(value, indent=2) + "\n")
 
@@ -187,7 +187,8 @@ def find_files(folder: PathLike, *patterns: str) -> list[pathlib.Path]:
     def stop(error: OSError) -> None:
         raise error
 
-    found, visited = [], set()
+    found = list[pathlib.Path]()
+    visited = set[str]()
     for parent, folders, names in os.walk(folder, onerror=stop, followlinks=True):
         real = os.path.realpath(parent)
         if real in visited:
@@ -267,7 +268,7 @@ def read_object(path: PathLike, *keys: str) -> JsonObject:
 
 def claim(
     path: PathLike,
-    wanted: Mapping[str, Any],
+    wanted: Mapping[str, object],
     what: str,
     *,
     fix: str = "choose another folder, or delete that one",
@@ -304,7 +305,7 @@ def claim(
         raise UserError(f"{place} holds {what}: {'; '.join(lines)}; {fix}")
 
 
-def differences(found: Any, wanted: Any, name: str = "config") -> list[str]:
+def differences(found: object, wanted: object, name: str = "config") -> list[str]:
     """Returns one line per difference between two trees of values read from JSON."""
     if found == wanted:
         return []

@@ -5,12 +5,16 @@ from __future__ import annotations
 import difflib
 import importlib
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Self, TypeVar
 
 import pydantic
 from annotated_types import Ge, Gt, Le, Lt
+from pydantic_core import ErrorDetails
 
 from radejax.core.errors import UserError, require
+from radejax.core.files import JsonObject
+
+Part = TypeVar("Part")
 
 Size = Annotated[int, Ge(1), Le(1 << 16)]
 """A number of channels, classes, heads or similar."""
@@ -55,25 +59,25 @@ class Options(pydantic.BaseModel):
     )
     section: ClassVar[str] = "config"
 
-    def __init_subclass__(cls, section: str = "", **options: Any) -> None:
-        super().__init_subclass__(**options)
+    def __init_subclass__(cls, section: str = "") -> None:
+        super().__init_subclass__()
         if section:
             cls.section = section
 
-    def __init__(self, **values: Any) -> None:
+    def __init__(self, **values: object) -> None:
         values = {name: as_tuples(value) for name, value in values.items()}
         try:
             super().__init__(**values)
         except pydantic.ValidationError as error:
             raise _explained(error, type(self), values) from None
 
-    def __setattr__(self, name: str, value: Any) -> None:
+    def __setattr__(self, name: str, value: object) -> None:
         raise UserError(
             f"{self.section}.{name} cannot be set, because options are immutable: use "
             f"config.replace or config.with_fields, which return new ones"
         )
 
-    def replace(self, **changes: Any) -> Self:
+    def replace(self, **changes: object) -> Self:
         """Returns validated options with other values.
 
         Args:
@@ -85,22 +89,22 @@ class Options(pydantic.BaseModel):
         """
         return type(self)(**_merged(self, changes))
 
-    def with_fields(self, fields: Mapping[str, Any]) -> Self:
+    def with_fields(self, fields: Mapping[str, object]) -> Self:
         """Returns validated options with other values by dotted names.
 
         Examples:
             config.with_fields({"train.batch_size": 4, "loss.weights.focal": 8.0})
         """
-        changes: dict[str, Any] = {}
+        changes: dict[str, object] = {}
         for name, value in fields.items():
             *sections, last = name.split(".")
-            place = changes
-            for section in sections:
-                place = place.setdefault(section, {})
-            place[last] = value
+            change = {last: value}
+            for section in reversed(sections):
+                change = {section: change}
+            changes = _merged(changes, change)
         return self.replace(**changes)
 
-    def fields(self) -> Iterator[tuple[str, Any]]:
+    def fields(self) -> Iterator[tuple[str, object]]:
         """Yields dotted name and value of every field of all sections."""
         for name, value in self:
             if isinstance(value, Options):
@@ -110,20 +114,25 @@ class Options(pydantic.BaseModel):
             else:
                 yield name, value
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Returns the values as nested dictionaries."""
         return self.model_dump()
 
 
-def _merged(current: Any, change: Any) -> Any:
-    """Returns a changed value; a mapping changes a section and is merged with its fields."""
-    if not isinstance(change, Mapping) or not isinstance(current, Options | Mapping):
-        return change
-    values = dict(current)
-    return values | {n: _merged(values.get(n), x) for n, x in change.items()}
+def _merged(
+    section: Options | Mapping[str, object], changes: Mapping[str, object]
+) -> dict[str, object]:
+    """Returns the changed fields of a section; a mapping changes fields of an inner one."""
+    values = dict(section)
+    for name, change in changes.items():
+        inner = values.get(name)
+        if isinstance(change, Mapping) and isinstance(inner, Options | Mapping):
+            change = _merged(inner, change)
+        values[name] = change
+    return values
 
 
-def as_tuples(value: Any) -> Any:
+def as_tuples(value: object) -> object:
     """Converts lists to tuples, recursively in lists and mappings."""
     if isinstance(value, list | tuple):
         return tuple(map(as_tuples, value))
@@ -133,11 +142,12 @@ def as_tuples(value: Any) -> Any:
 
 
 def _explained(
-    error: pydantic.ValidationError, cls: type[Options], values: Mapping[str, Any]
+    error: pydantic.ValidationError, cls: type[Options], values: Mapping[str, object]
 ) -> UserError:
     """Returns the first error with the full name of its field."""
     errors = error.errors(include_url=False)
-    first, place = errors[0], _place(errors[0]["loc"], values)
+    first = errors[0]
+    place = _place(first["loc"], values)
     if isinstance(cause := first.get("ctx", {}).get("error"), UserError):
         return cause  # a section's own message
     name = f"{cls.section}{place}"
@@ -165,7 +175,7 @@ def _place(steps: Sequence[str | int], values: Any) -> str:
     return place
 
 
-def _expected(error: Any) -> str:
+def _expected(error: ErrorDetails) -> str:
     """Returns pydantic's description of the values that are allowed, in our words."""
     text = error["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
     text = text.partition(" after validation")[0]
@@ -179,8 +189,8 @@ def _expected(error: Any) -> str:
 
 
 def find_part(
-    name: str, field: str, known: Mapping[str, Any], kind: type = object
-) -> Any:
+    name: str, field: str, known: Mapping[str, Part | None], kind: type = object
+) -> Part:
     """Returns the class, function or object that a field of a config names.
 
     Args:
@@ -193,8 +203,9 @@ def find_part(
     Raises:
         UserError: There is no such part, or it is of another kind.
     """
-    part, (module, _, attribute) = known.get(str(name)), str(name).partition(":")
+    part = known.get(str(name))
     if part is None:
+        module, _, attribute = str(name).partition(":")
         expected = " or ".join([*map(repr, known), "module:Object"])
         is_name = isinstance(name, str) and bool(module and attribute)
         require(is_name, field, name, expected)

@@ -12,15 +12,20 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jaxtyping import Bool, Float, Int, Real, Shaped
+from jaxtyping import Bool, Float, Int, PyTree, Real, Shaped
+from numpy.typing import ArrayLike
 
 from radejax.core.errors import DataError
+from radejax.core.files import JsonObject
+
+if TYPE_CHECKING:
+    import pandas
 
 Array = jax.Array | np.ndarray
 
@@ -89,9 +94,9 @@ class Batch(struct.PyTreeNode):
     is_valid: Bool[Array, "B N"]
     frame: Int[Array, " B"]
     image: Real[Array, "B _ _ _"] | None = None
-    camera: Any = None
+    camera: PyTree[Array] | None = None
 
-    def model_inputs(self) -> tuple[Any, ...]:
+    def model_inputs(self) -> tuple[PyTree[Array], ...]:
         """Returns the positional inputs of a model.
 
         These are the projection and, if the batch has images, the images and cameras.
@@ -173,15 +178,15 @@ class Detections(struct.PyTreeNode):
             score=np.asarray(self.scores, np.float64)[position, row],
         )
 
-    def to_list(self) -> list[list[dict[str, Any]]]:
+    def to_list(self) -> list[list[JsonObject]]:
         """Returns a list of dictionaries per frame, see `Boxes.to_list`."""
-        frames: list[list[dict[str, Any]]] = [[] for _ in range(len(self.is_valid))]
+        frames: list[list[JsonObject]] = [[] for _ in range(len(self.is_valid))]
         boxes = self.to_boxes()
         for frame, row in zip(boxes.frame.tolist(), boxes.to_list(), strict=True):
             frames[frame].append(row)
         return frames
 
-    def to_pandas(self) -> Any:
+    def to_pandas(self) -> pandas.DataFrame:
         """Returns a `pandas.DataFrame` with one row per detection.
 
         pandas is installed by the extra "notebook".
@@ -249,7 +254,9 @@ class Boxes:
             )
 
     @classmethod
-    def one_frame(cls, box: Any, names: Any, score: Any = None) -> Boxes:
+    def one_frame(
+        cls, box: ArrayLike, names: ArrayLike, score: ArrayLike | None = None
+    ) -> Boxes:
         """Creates the boxes of a single frame, whose index is 0.
 
         Args:
@@ -265,11 +272,9 @@ class Boxes:
     @classmethod
     def from_columns(cls, columns: Mapping[str, Shaped[np.ndarray, "N ..."]]) -> Boxes:
         """Creates boxes from the columns that `columns` returns."""
-        extras: dict[str, Any] = dict(columns)
-        known = {
-            name: extras.pop(name, None) for name in ("frame", "box", "cls", "score")
-        }
-        return cls(**known, extras=extras)
+        extras = dict(columns)
+        frame, box, names = (extras.pop(name) for name in ("frame", "box", "cls"))
+        return cls(frame, box, names, extras.pop("score", None), extras)
 
     @classmethod
     def concatenate(cls, parts: Sequence[Boxes]) -> Boxes:
@@ -289,7 +294,8 @@ class Boxes:
 
         `decode` clips smaller sizes to this value by default.
         """
-        return self.box[:, 3:6].min(axis=1) <= np.float32(MIN_SIZE_M)
+        smallest: Float[np.ndarray, " N"] = self.box[:, 3:6].min(axis=1)
+        return smallest <= np.float32(MIN_SIZE_M)
 
     def take(self, rows: Shaped[np.ndarray, " K"]) -> Boxes:
         """Returns the boxes selected by an array of positions or a boolean mask."""
@@ -310,7 +316,7 @@ class Boxes:
         box = dict(zip(BOX_FIELDS, self.box.T, strict=True))
         return {"cls": self.cls, **score, **box, **self.extras}
 
-    def to_list(self) -> list[dict[str, Any]]:
+    def to_list(self) -> list[JsonObject]:
         """Returns one dictionary per box, with its `fields` as Python scalars and text."""
         fields = self.fields()
         rows = zip(*(column.tolist() for column in fields.values()), strict=True)

@@ -15,17 +15,29 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import resource_tracker
-from typing import Any
+from typing import ParamSpec, Protocol, TypeVar
 
 from radejax.core.errors import UserError
 
-Submit = Callable[..., concurrent.futures.Future[Any]]
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
 
 # At K-Radar's size, 446 MB were measured for reading a compressed radar tensor and 320 MB
 # for simulating with images, libraries included.
 _WORKER_BYTES = 450e6
 _CONTROL_GROUPS = pathlib.Path("/sys/fs/cgroup")
 _PROC = pathlib.Path("/proc")
+
+
+class Submit(Protocol):
+    """Function that starts a call in a worker process and returns the future result."""
+
+    def __call__(
+        self,
+        function: Callable[Arguments, Result],
+        *args: Arguments.args,
+        **kwargs: Arguments.kwargs,
+    ) -> concurrent.futures.Future[Result]: ...
 
 
 def usable_cpus() -> int:
@@ -84,7 +96,7 @@ def _read(path: pathlib.Path) -> str:
 
 @contextlib.contextmanager
 def process_pool(
-    num_workers: int, start: Callable[..., Any] | None = None, *arguments: Any
+    num_workers: int, start: Callable[..., object] | None = None, *arguments: object
 ) -> Iterator[Submit]:
     """Runs worker processes during a block and yields a function to submit work.
 
@@ -106,8 +118,8 @@ def process_pool(
     """
     others = multiprocessing.active_children()
     context = multiprocessing.get_context("spawn")
-    given = (start, *arguments)
-    pool = concurrent.futures.ProcessPoolExecutor(num_workers, context, _start, given)
+    begin = functools.partial(_start, start, *arguments)
+    pool = concurrent.futures.ProcessPoolExecutor(num_workers, context, begin)
     try:
         with pool:
             try:
@@ -129,9 +141,10 @@ def process_pool(
 
 def _submit(
     pool: concurrent.futures.ProcessPoolExecutor,
-    function: Callable[..., Any],
-    *arguments: Any,
-) -> concurrent.futures.Future[Any]:
+    function: Callable[Arguments, Result],
+    *args: Arguments.args,
+    **kwargs: Arguments.kwargs,
+) -> concurrent.futures.Future[Result]:
     """Submits work while SIGINT is blocked.
 
     A process that the pool starts for it inherits this signal mask. A mask that the process
@@ -140,12 +153,12 @@ def _submit(
     resource_tracker.ensure_running()  # starting it later would clear the mask
     old = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        return pool.submit(function, *arguments)
+        return pool.submit(function, *args, **kwargs)
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, old)
 
 
-def _start(start: Callable[..., Any] | None, *arguments: Any) -> None:
+def _start(start: Callable[..., object] | None, *arguments: object) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     if start is not None:
         start(*arguments)

@@ -82,11 +82,11 @@ class LossOptions(Options, section="config.loss"):
         Raises:
             UserError: One of `own_terms` cannot be imported.
         """
-        own = {
-            place.partition(":")[2]: find_part(place, "config.loss.own_terms", {})
-            for place in self.own_terms
-        }
-        return LOSSES | own
+        terms = dict(LOSSES)
+        for place in self.own_terms:
+            name = place.partition(":")[2]
+            terms[name] = find_part(place, "config.loss.own_terms", {})
+        return terms
 
 
 def detection_loss(
