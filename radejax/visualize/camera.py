@@ -7,12 +7,11 @@ to pixels with the calibration. The sensor offset must be added to boxes of labe
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
+from numpy.typing import ArrayLike
 
 from radejax.core.errors import UserError
 from radejax.core.structures import Boxes
@@ -26,7 +25,7 @@ _NEAR_M = 0.5
 
 
 def draw_camera(
-    image: Any,
+    image: ArrayLike,
     calibration: CameraCalibration,
     *,
     ground_truth: Boxes | None = None,

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
 
 from radejax.core import files
 from radejax.core.errors import DataError
@@ -17,8 +17,7 @@ from radejax.visualize.style import SERIES_COLORS, new_figure
 
 _LINE_STYLES = ("-", "--", "-.", ":")
 
-
-Curve = tuple[Any, Any] | None
+Curve = tuple[ArrayLike, ArrayLike] | None
 """Recall `[K]` and precision `[K]`, both in [0, 1], of one line; None draws nothing."""
 
 
@@ -50,7 +49,17 @@ def _draw_panel(ax: Axes, curves: Mapping[str, Curve]) -> None:
         if curve is not None:
             recall, precision = (np.asarray(values, float) for values in curve)
             order = np.argsort(recall, kind="stable")
-            ax.plot(recall[order], precision[order], label=label, **_line(i))
+            ax.plot(
+                recall[order],
+                precision[order],
+                label=label,
+                # The first 24 lines all differ.
+                color=SERIES_COLORS[i % len(SERIES_COLORS)],
+                linestyle=_LINE_STYLES[
+                    (i + i // len(SERIES_COLORS)) % len(_LINE_STYLES)
+                ],
+                linewidth=1.8,
+            )
             is_empty = is_empty and not recall.any()
     limits = (0, 1.02)
     ax.set(xlim=limits, ylim=limits, xlabel="recall", ylabel="precision")
@@ -93,7 +102,9 @@ def read_metrics(path: files.PathLike) -> dict[str, tuple[np.ndarray, np.ndarray
 
 
 def draw_training(
-    series: Mapping[str, tuple[Any, Any]], keys: Sequence[str], title: str = ""
+    series: Mapping[str, tuple[ArrayLike, ArrayLike]],
+    keys: Sequence[str],
+    title: str = "",
 ) -> Figure:
     """Draw the losses of a run over steps, one panel per key.
 
@@ -128,13 +139,6 @@ def moving_mean(values: Float[np.ndarray, " N"], width: int) -> Float[np.ndarray
     rows = np.stack([np.where(is_finite, values, 0.0), is_finite])
     sums = np.cumsum(np.pad(rows, ((0, 0), (width, 0))), axis=1)
     total, count = sums[:, width:] - sums[:, :-width]
-    return np.divide(total, count, out=np.full(values.shape, np.nan), where=count > 0)
-
-
-def _line(i: int) -> dict[str, Any]:
-    """Return color and dash pattern of the i-th line; the first 24 lines all differ."""
-    return {
-        "color": SERIES_COLORS[i % len(SERIES_COLORS)],
-        "linestyle": _LINE_STYLES[(i + i // len(SERIES_COLORS)) % len(_LINE_STYLES)],
-        "linewidth": 1.8,
-    }
+    means = np.full(values.shape, np.nan)
+    np.divide(total, count, out=means, where=count > 0)
+    return means

@@ -14,7 +14,7 @@ as such.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -23,6 +23,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from numpy.typing import ArrayLike
 
 from radejax.core.errors import UserError
 from radejax.core.structures import ROIS
@@ -47,7 +48,7 @@ _COLUMN_IN, _ROW_IN = 4.9, 8.0  # large enough for scores of crowded scenes
 
 
 def draw_map(
-    values: Any,
+    values: ArrayLike,
     grid: RadarGrid,
     *,
     ax: Axes | None = None,
@@ -142,15 +143,26 @@ def draw_bev(scene: Scene, *, color_limits: tuple[float, float] | None = None) -
         The axes; `.figure` is the figure.
     """
     ax = _draw_ground(scene, color_limits=color_limits, label=POWER_LABEL)
-    _add_legend(ax, scene, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4)
+    _add_legend(ax, scene, "lower center", (0.5, 1.0), 4)
     ax.set_title(scene.title, pad=24)
     return ax
 
 
-def _draw_ground(scene: Scene, **options: Any) -> Axes:
-    """Draw map, region, boxes and sensor; `options` are passed to `draw_map`."""
-    extent = _extent_m(scene.grid, scene.roi)
-    ax = draw_map(scene.power, scene.grid, extent=extent, **options)
+def _draw_ground(
+    scene: Scene,
+    ax: Axes | None = None,
+    color_limits: tuple[float, float] | None = None,
+    label: str = "",
+) -> Axes:
+    """Draw map, region, boxes and sensor; see `draw_map` for the other arguments."""
+    ax = draw_map(
+        scene.power,
+        scene.grid,
+        ax=ax,
+        extent=_extent_m(scene.grid, scene.roi),
+        color_limits=color_limits,
+        label=label,
+    )
     if scene.lidar_m is not None:
         style.draw_points(ax, scene.lidar_m[:, 1::-1])
     _draw_over(ax, scene, lambda points: points[..., ::-1])
@@ -162,14 +174,16 @@ def _draw_ground(scene: Scene, **options: Any) -> Axes:
 def bin_edges(centers: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n+1"]:
     """Return the edges of bins; a single bin is drawn with a width of 1."""
     if centers.size == 1:
-        return centers[0] + np.array([-0.5, 0.5])
+        return np.array([centers[0] - 0.5, centers[0] + 0.5])
     return values_at(centers, np.arange(centers.size + 1) - 0.5)
 
 
 def to_polar(points: Float[np.ndarray, "*points 2"]) -> Float[np.ndarray, "*points 2"]:
     """Convert ground positions to azimuth in degrees, positive to the right, and range."""
+    polar: Float[np.ndarray, "*points 2"]
     x, y = points[..., 0], points[..., 1]
-    return np.stack([np.rad2deg(-np.arctan2(y, x)), np.hypot(x, y)], -1)
+    polar = np.stack([np.rad2deg(-np.arctan2(y, x)), np.hypot(x, y)], -1)
+    return polar
 
 
 def _draw_polar(ax: Axes, scene: Scene, *, show_labels: bool) -> None:
@@ -202,7 +216,7 @@ def draw_frame(scene: Scene) -> Figure:
     if has_image:
         _draw_view(figure.add_axes((0.53, 0.40, 0.45, 0.52)), scene)
     place = (0.765, 0.095 + height)
-    _add_legend(figure, scene, loc="lower center", bbox_to_anchor=place, ncols=3)
+    _add_legend(figure, scene, "lower center", place, 3)
     figure.suptitle(scene.title)
     return figure
 
@@ -225,9 +239,10 @@ def draw_scenes(scenes: Sequence[Scene]) -> Figure:
     values = [scene.power.ravel() for scene in scenes]
     low, high = np.nanpercentile(np.concatenate(values), _SCENE_PERCENTILES)
     limits = (float(low), float(max(high, low + 1e-3)))
+    across = 0.83 / columns
     for index, scene in enumerate(scenes):
         row, column = divmod(index, columns)
-        left, across = (column + 0.14) / columns, 0.83 / columns
+        left = (column + 0.14) / columns
         base = height - row_in * (row + 1) - 0.05  # inches
         above = None
         if scene.image is not None:
@@ -249,16 +264,17 @@ def draw_scenes(scenes: Sequence[Scene]) -> Figure:
     _add_legend(
         figure,
         scenes[0],
+        "lower left",
+        (0.3 / width, (foot_in - _FOOT_IN + 0.2) / height),
+        3 if columns > 1 else 1,
         show_counts=False,
-        loc="lower left",
-        bbox_to_anchor=(0.3 / width, (foot_in - _FOOT_IN + 0.2) / height),
-        ncols=3 if columns > 1 else 1,
     )
     return figure
 
 
 def _draw_view(ax: Axes, scene: Scene, *, show_labels: bool = True) -> None:
     """Draw the camera image, and the boxes on it if a calibration is given."""
+    assert scene.image is not None
     if scene.camera is None:
         ax.imshow(np.asarray(scene.image))
         ax.set_axis_off()
@@ -350,7 +366,13 @@ def _heading_marks(boxes: Float[np.ndarray, "N 7"]) -> Float[np.ndarray, "N 2 2"
 
 
 def _add_legend(
-    owner: Axes | Figure, scene: Scene, *, show_counts: bool = True, **place: Any
+    owner: Axes | Figure,
+    scene: Scene,
+    loc: Literal["lower center", "lower left"],
+    anchor: tuple[float, float],
+    ncols: int,
+    *,
+    show_counts: bool = True,
 ) -> None:
     """Add a legend with one handle per kind of line to axes or a figure."""
     handles = []
@@ -370,7 +392,14 @@ def _add_legend(
         line = Line2D([], [], color=style.ROI_COLOR, lw=1.4, ls="--", label=label)
         handles.append(line)
     # Counts, threshold and region fit in this font size.
-    owner.legend(handles=handles, fontsize=8, frameon=False, **place)
+    owner.legend(
+        handles=handles,
+        fontsize=8,
+        frameon=False,
+        loc=loc,
+        bbox_to_anchor=anchor,
+        ncols=ncols,
+    )
 
 
 # Slices -------------------------------------------------------------------------------
@@ -434,7 +463,8 @@ def _outlines(
 ) -> tuple[list[Float[np.ndarray, "_ 2"]], ...]:
     """Return the lines of boxes in the three slices, with bars at a Doppler of 0."""
     azimuth_range = [to_polar(outline) for outline in style.footprints(boxes, 8)]
-    bars, azimuth_elevation = [], []
+    bars = []
+    azimuth_elevation = []
     for outline, points in zip(azimuth_range, corners(boxes), strict=True):
         ground = to_polar(points[:, :2])
         height = np.rad2deg(np.arctan2(points[:, 2], ground[:, 1]))

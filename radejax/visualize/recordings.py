@@ -6,10 +6,9 @@ Recordings show radar map, boxes and camera over time. Only they need the extra 
 
 from __future__ import annotations
 
-import os
 import pathlib
 from collections.abc import Iterable
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -19,14 +18,17 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from radejax.core.errors import UserError
-from radejax.core.files import as_path, atomic_path
+from radejax.core.files import PathLike, as_path, atomic_path
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.visualize.style import COLOR_MAP, Scene, color_limits_of, label_texts
+
+if TYPE_CHECKING:
+    import rerun
 
 
 def animate(
     figures: Iterable[Figure],
-    path: str | os.PathLike,
+    path: PathLike,
     *,
     frames_per_second: float = 10.0,
 ) -> pathlib.Path:
@@ -69,7 +71,7 @@ def _image_of(figure: Figure) -> Image.Image:
     return Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
 
 
-def write_recording(scenes: Iterable[Scene], path: str | os.PathLike) -> None:
+def write_recording(scenes: Iterable[Scene], path: PathLike) -> None:
     """Write scenes to a recording (.rrd) that `rerun PATH` opens.
 
     Args:
@@ -120,7 +122,7 @@ def yaw_quaternions(yaw_rad: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 4"
     return np.stack([zero, zero, np.sin(yaw_rad / 2), np.cos(yaw_rad / 2)], -1)
 
 
-def _log_scene(stream: Any, scene: Scene, index: int) -> None:
+def _log_scene(stream: rerun.RecordingStream, scene: Scene, index: int) -> None:
     """Log one frame's radar map, boxes, image and title."""
     import rerun as rr
 

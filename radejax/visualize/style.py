@@ -11,17 +11,18 @@ import dataclasses
 import io
 import pathlib
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import Literal, NamedTuple
 
 import matplotlib
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.backend_bases import FigureCanvasBase
-from matplotlib.collections import LineCollection
+from matplotlib.collections import LineCollection, QuadMesh
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
-from matplotlib.patheffects import Normal, Stroke
+from matplotlib.patheffects import AbstractPathEffect, Normal, Stroke
+from numpy.typing import ArrayLike
 
 from radejax.core.errors import UserError
 from radejax.core.files import PathLike, as_path, atomic_path
@@ -38,8 +39,15 @@ ROI_COLOR = "black"
 LIDAR_COLOR = "#ffa64d"
 # The color-blind safe palette of Okabe and Ito, with a yellow that is visible on paper.
 SERIES_COLORS = (
-    "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#8A6D00",
-)  # fmt: skip
+    "#0072B2",
+    "#D55E00",
+    "#009E73",
+    "#CC79A7",
+    "#E69F00",
+    "#56B4E9",
+    "#000000",
+    "#8A6D00",
+)
 
 
 class Style(NamedTuple):
@@ -88,12 +96,12 @@ class Scene:
             frames.
     """
 
-    projection: Any
+    projection: ArrayLike
     grid: RadarGrid
     ground_truth: Boxes | None = None
     predictions: Boxes | None = None
     roi: Sequence[float] | None = None
-    image: Any = None
+    image: ArrayLike | None = None
     camera: CameraCalibration | None = None
     title: str = ""
     score_threshold: float | None = None
@@ -123,7 +131,9 @@ class Scene:
     @property
     def power(self) -> Float[np.ndarray, "R A"]:
         """Maximum over all channels, which equals that over Doppler and elevation."""
-        return np.asarray(self.projection, np.float32).max(-1)
+        power: Float[np.ndarray, "R A"]
+        power = np.asarray(self.projection, np.float32).max(-1)
+        return power
 
 
 def styled_sets(
@@ -169,7 +179,7 @@ def draw_tiles(
     edges_y: Float[np.ndarray, "*edges_y"],
     values: Float[np.ndarray, "rows columns"],
     color_limits: tuple[float, float] | None = None,
-) -> Any:
+) -> QuadMesh:
     """Draw one tile per value; the color limits are `color_limits_of(values)` by default."""
     low, high = color_limits or color_limits_of(values)
     return ax.pcolormesh(
@@ -187,7 +197,7 @@ def draw_lines(
     ax: Axes,
     lines: Sequence[Float[np.ndarray, "_ 2"]],
     color: str,
-    widths: Any,
+    widths: ArrayLike,
     zorder: float = 4.0,
 ) -> None:
     """Draw lines with a black outline of half a point, without changing the axes limits."""
@@ -216,7 +226,7 @@ def line_scales(
     return np.clip(size_pt / full_pt, 0.4, 1.0)
 
 
-def halo(width: float, color: str = "black") -> list:
+def halo(width: float, color: str = "black") -> list[AbstractPathEffect]:
     """Return path effects that outline lines and text to be legible on any map."""
     return [Stroke(linewidth=width, foreground=color), Normal()]
 
@@ -224,7 +234,8 @@ def halo(width: float, color: str = "black") -> list:
 # Texts next to boxes -----------------------------------------------------------------
 
 # Sizes of DejaVu Sans, in units of the font size.
-_CHARACTER_WIDTH, _LINE_HEIGHT = 0.60, 1.25
+_CHARACTER_WIDTH = 0.60
+_LINE_HEIGHT = 1.25
 _ALIGN = {
     "left": ("right", -1, 0),
     "right": ("left", 1, 0),
@@ -308,9 +319,15 @@ class _NotebookFigure(Figure):
         return buffer.getvalue()
 
 
-def new_figure(width_in: float, height_in: float, **options: Any) -> Figure:
+def new_figure(
+    width_in: float,
+    height_in: float,
+    *,
+    dpi: float = 110,
+    layout: Literal["constrained"] | None = None,
+) -> Figure:
     """Return an empty figure outside pyplot's list of open figures."""
-    return _NotebookFigure(figsize=(width_in, height_in), **{"dpi": 110, **options})
+    return _NotebookFigure((width_in, height_in), dpi, layout=layout)
 
 
 def color_limits_of(values: np.ndarray) -> tuple[float, float]:
