@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pathlib
 import time
-from typing import Any
+from typing import TYPE_CHECKING, Literal, Unpack
 
 import click
 
@@ -12,6 +12,9 @@ import radejax
 from radejax.cli import entry
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import read_object
+
+if TYPE_CHECKING:
+    from radejax.data.records import PreprocessReport
 
 _rate = click.option(
     "--rate",
@@ -21,8 +24,8 @@ _rate = click.option(
 )
 
 
-def _echo_report(report: Any) -> None:
-    """Prints a `PreprocessReport`; the exit code is 1 if frames were skipped."""
+def _echo_report(report: PreprocessReport) -> None:
+    """Prints a report; the exit code is 1 if frames were skipped."""
     click.echo(report.to_text())
     if report.skipped:
         raise SystemExit(entry.FAILED)
@@ -72,7 +75,7 @@ def simulate(
     sequence_numbers: tuple[int, ...] | None,
     full_size: bool,
     num_workers: int | None,
-    **fields: Any,
+    **fields: object,
 ) -> None:
     """Simulate a dataset in K-Radar's folders and file formats.
 
@@ -97,12 +100,12 @@ def simulate(
         if section is None:
             raise UserError(f"{config} has no `simulation` section")
         simulation = section
-    values = dict(simulation) | (FULL_SIZE if full_size else {})
+    values: dict[str, object] = dict(FULL_SIZE if full_size else {})
     if radar is not None:
         values |= read_object(radar, "grid", "radar")
     fields["sequences"] = sequence_numbers
     values |= {name: value for name, value in fields.items() if value is not None}
-    simulation = SimulationOptions(**values)
+    simulation = simulation.replace(**values)
     radejax.simulate(simulation, out, num_workers=num_workers)
     click.echo(f"simulated dataset in {out}")
 
@@ -118,7 +121,12 @@ def data() -> None:
 @entry.camera_calibration
 @click.option("--deep", is_flag=True, help="Read every radar tensor completely.")
 @entry.json_option
-def check(roots: tuple[str, ...], as_json: bool, **options: Any) -> None:
+def check(
+    roots: tuple[str, ...],
+    deep: bool,
+    as_json: bool,
+    **part: Unpack[entry.LabelledPart],
+) -> None:
     """Report what is there, what is missing and what is corrupted.
 
     Exit code 1 if anything is missing or corrupted.
@@ -127,7 +135,7 @@ def check(roots: tuple[str, ...], as_json: bool, **options: Any) -> None:
     """
     from radejax.data.kradar.check import check_dataset
 
-    report = check_dataset(roots, progress=not as_json, **options)
+    report = check_dataset(roots, deep=deep, progress=not as_json, **part)
     entry.echo_result(as_json, report.to_dict(), report.to_text())
     if report.num_problems:
         raise SystemExit(entry.FAILED)
@@ -164,7 +172,7 @@ def preprocess(
     dtype: str | None,
     num_workers: int | None,
     shard: tuple[int, int],
-    **part: Any,
+    **part: Unpack[entry.LabelledPart],
 ) -> None:
     """Project radar tensors to records of range-azimuth maps.
 
@@ -194,7 +202,12 @@ def preprocess(
     help="polar3d: mean power and Doppler of every cell. rpc: the strongest cells.",
 )
 @_rate
-def reduce(roots: tuple[str, ...], out: pathlib.Path, **options: Any) -> None:
+def reduce(
+    roots: tuple[str, ...],
+    out: pathlib.Path,
+    release: Literal["polar3d", "rpc"],
+    rate: float,
+) -> None:
     """Write the files of K-Radar's reduced releases from radar tensors.
 
     The other files of ROOTS become symbolic links. Run again, it writes only missing files.
@@ -204,7 +217,7 @@ def reduce(roots: tuple[str, ...], out: pathlib.Path, **options: Any) -> None:
     """
     from radejax.data.kradar.reduce import reduce_dataset
 
-    _echo_report(reduce_dataset(roots, out, **options))
+    _echo_report(reduce_dataset(roots, out, release=release, rate=rate))
 
 
 @click.command(cls=entry.Command)
@@ -236,9 +249,11 @@ def points(
     paths: tuple[str, ...],
     out: pathlib.Path,
     suffix: str,
+    method: Literal["percentile", "cfar"],
+    rate: float,
+    threshold_db: float,
     sequence_numbers: tuple[int, ...] | None,
     weather: tuple[str, ...] | None,
-    **options: Any,
 ) -> None:
     """Write radar points of radar tensors, projections, polar3d or rpc files.
 
@@ -274,7 +289,14 @@ def points(
     began = time.perf_counter()
     for target, path in tqdm.tqdm(sources.items(), "points", unit="frame"):
         try:
-            cloud = read_points(path, grid, is_axis_up=is_axis_up, **options)
+            cloud = read_points(
+                path,
+                grid,
+                method=method,
+                rate=rate,
+                threshold_db=threshold_db,
+                is_axis_up=is_axis_up,
+            )
         except (DataError, OSError) as error:
             skipped[str(path)] = str(error)
             continue
@@ -312,7 +334,7 @@ def embed(
     out: pathlib.Path,
     dtype: str | None,
     batch_size: int,
-    **part: Any,
+    **part: Unpack[entry.Part],
 ) -> None:
     """Precompute frozen-backbone features of the front camera images.
 

@@ -2,13 +2,43 @@
 
 from __future__ import annotations
 
+import functools
 import pathlib
-from typing import Any
+from typing import TYPE_CHECKING, Unpack
 
 import click
 
 import radejax
 from radejax.cli import entry
+
+if TYPE_CHECKING:
+    from radejax.inference.saved import Step
+
+
+def _loaded(command: entry.Function) -> entry.Function:
+    """Makes a command receive the detector that its options describe."""
+
+    @functools.wraps(command)
+    def loaded(
+        *,
+        source: str,
+        step: Step = None,
+        image_backbone: str | None,
+        score_threshold: float | None = None,
+        nms_iou: float | None = None,
+        **options: object,
+    ) -> None:
+        entry.set_up_jax()
+        detector = radejax.Detector.from_workdir(
+            source,
+            step,
+            image_backbone=image_backbone,
+            score_threshold=score_threshold,
+            nms_iou=nms_iou,
+        )
+        command(detector=detector, **options)
+
+    return loaded
 
 
 @click.command(cls=entry.Command)
@@ -46,18 +76,15 @@ from radejax.cli import entry
 @entry.batch_size(8, "Frames per call of the detector.")
 @entry.image_backbone
 @entry.json_option
+@_loaded
 def detect(
     roots: tuple[str, ...],
-    source: str,
+    detector: radejax.Detector,
     out: pathlib.Path,
-    step: Any,
-    image_backbone: str | None,
-    score_threshold: float | None,
-    nms_iou: float | None,
     batch_size: int,
     file_format: str,
     as_json: bool,
-    **found_by: Any,
+    **part: Unpack[entry.Part],
 ) -> None:
     """Find boxes in every frame below the folders.
 
@@ -71,15 +98,7 @@ def detect(
     """
     from radejax.inference.detect_files import detect_files, find_inputs
 
-    entry.set_up_jax()
-    detector = radejax.Detector.from_workdir(
-        source,
-        step,
-        image_backbone=image_backbone,
-        score_threshold=score_threshold,
-        nms_iou=nms_iou,
-    )
-    inputs = find_inputs(detector, roots, **found_by)
+    inputs = find_inputs(detector, roots, **part)
     count = detect_files(
         detector, inputs, out, batch_size=batch_size, file_format=file_format
     )
@@ -106,7 +125,7 @@ def detect(
 )
 @entry.several(
     "--platforms",
-    default=["cpu,cuda,tpu"],
+    default=("cpu,cuda,tpu",),
     help="Platforms of the StableHLO program.",
 )
 @entry.image_backbone
@@ -131,8 +150,16 @@ def detect(
 @click.option(
     "--half", is_flag=True, help="Store weights as float16 (huggingface only)."
 )
+@_loaded
 def export(
-    source: str, out: pathlib.Path, image_backbone: str | None, **settings: Any
+    detector: radejax.Detector,
+    out: pathlib.Path,
+    kind: str,
+    platforms: tuple[str, ...],
+    with_backbone: bool,
+    batch_size: int | None,
+    radar_input: str,
+    half: bool,
 ) -> None:
     """Export a model as a folder for other programs.
 
@@ -145,9 +172,16 @@ def export(
     """
     from radejax.inference import export as exporting
 
-    entry.set_up_jax()
-    detector = radejax.Detector.from_workdir(source, image_backbone=image_backbone)
-    done = exporting.export(detector, out, **settings)
+    done = exporting.export(
+        detector,
+        out,
+        kind=kind,
+        platforms=platforms,
+        with_backbone=with_backbone,
+        batch_size=batch_size,
+        half=half,
+        radar_input=radar_input,
+    )
     text = f"{done['bytes'] / 2**20:.1f} MiB written to {out}"
     if done["left_out"]:
         text += f", without {', '.join(done['left_out'])}"

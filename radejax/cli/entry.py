@@ -16,12 +16,17 @@ import re
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NotRequired, TypedDict, TypeVar
 
 import click
 
 from radejax.core.compilation_cache import enable_compilation_cache
 from radejax.core.files import is_no_space
+
+T = TypeVar("T")
+Function = Callable[..., object]
+Decorator = Callable[[Function], Function]
+"""Adds one or more options to the function of a command."""
 
 FAILED = 1
 WRONG_USE = 2
@@ -109,7 +114,7 @@ def set_up_jax() -> None:
 # Commands ----------------------------------------------------------------------------
 
 
-SETTINGS: dict[str, Any] = {
+SETTINGS: dict[str, object] = {
     "help_option_names": ["-h", "--help"],
     "show_default": True,
 }
@@ -153,14 +158,14 @@ class Command(click.Command):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         return super().parse_args(ctx, expand_home(args))
 
-    def invoke(self, ctx: click.Context) -> Any:
+    def invoke(self, ctx: click.Context) -> object:
         with exit_codes(debug=ctx.params.pop("debug")):
             if os.getcwd() not in sys.path:
                 sys.path.append(os.getcwd())
             return super().invoke(ctx)
 
 
-def echo_result(as_json: bool, values: Any, text: str) -> None:
+def echo_result(as_json: bool, values: object, text: str) -> None:
     """Prints a result as JSON or as text."""
     click.echo(json.dumps(values) if as_json else text)
 
@@ -171,8 +176,10 @@ def echo_result(as_json: bool, values: Any, text: str) -> None:
 class _Number(click.FloatRange):
     """Finite numbers in a range; click's own type accepts NaN."""
 
-    def convert(self, value: Any, param: Any, ctx: Any) -> float:
-        number = super().convert(value, param, ctx)
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        number: float = super().convert(value, param, ctx)
         if not math.isfinite(number):
             self.fail(f"{value} is not a finite number", param, ctx)
         return number
@@ -195,22 +202,26 @@ def _step(text: str) -> int | str:
 
 def several(
     *names: str,
-    kind: Callable[[str], Any] = str,
+    help: str,
+    kind: Callable[[str], object] = str,
     metavar: str = "A,B,...",
-    **settings: Any,
-) -> Callable[[Any], Any]:
+    required: bool = False,
+    default: tuple[str, ...] = (),
+) -> Decorator:
     """Returns an option for several values: `--data A,B --data C` gives A, B and C.
 
     Args:
         *names: Names of the option, as for `click.option`.
+        help: Help of the option.
         kind: Function that converts the text of each value.
         metavar: Example of the values, shown in the help.
-        **settings: Other arguments of `click.option`.
+        required: Whether the option must be given.
+        default: Values of the option if it is not given.
     """
 
     def split(
         _: click.Context, __: click.Parameter, values: tuple[str, ...]
-    ) -> tuple[Any, ...] | None:
+    ) -> tuple[object, ...] | None:
         words = (word.strip() for value in values for word in value.split(","))
         try:
             found = tuple(kind(word) for word in words if word)
@@ -221,13 +232,17 @@ def several(
         return found or None
 
     return click.option(
-        *names, multiple=True, callback=split, metavar=metavar, **settings
+        *names,
+        multiple=True,
+        callback=split,
+        metavar=metavar,
+        help=help,
+        required=required,
+        default=default,
     )
 
 
-def together(
-    *options: Callable[[Any], Any], group: str = "Options"
-) -> Callable[[Any], Any]:
+def together(*options: Decorator, group: str = "Options") -> Decorator:
     """Returns a decorator that adds several options in order.
 
     Args:
@@ -235,28 +250,28 @@ def together(
         group: Heading of the options in the help.
     """
 
-    def decorate(command: Any) -> Any:
-        count = len(getattr(command, "__click_params__", ()))
+    def decorate(function: Function) -> Function:
+        count = len(vars(function).get("__click_params__", ()))
         for option in reversed(options):
-            command = option(command)
-        for parameter in command.__click_params__[count:]:
+            function = option(function)
+        for parameter in vars(function)["__click_params__"][count:]:
             parameter.group = group
-        return command
+        return function
 
     return decorate
 
 
-def out_file(default: str, meaning: str) -> Callable[[Any], Any]:
+def out_file(default: str, meaning: str) -> Decorator:
     """Returns the option `--out` for the file to write."""
     return click.option("--out", type=FILE, default=default, help=meaning)
 
 
-def out_folder(meaning: str) -> Callable[[Any], Any]:
+def out_folder(meaning: str) -> Decorator:
     """Returns the required option `--out` for the folder to write."""
     return click.option("--out", required=True, type=FOLDER, help=meaning)
 
 
-def batch_size(default: int, meaning: str) -> Callable[[Any], Any]:
+def batch_size(default: int, meaning: str) -> Decorator:
     """Returns the option `--batch-size`."""
     return click.option("--batch-size", type=COUNT, default=default, help=meaning)
 
@@ -281,6 +296,23 @@ weather = several(
     help="Use sequences with this weather only. Default: all.",
 )
 part = together(labels, sequences, weather)
+
+
+class Part(TypedDict):
+    """Values of `part` and, if a command has it, of `camera_calibration`."""
+
+    labels: str | None
+    sequence_numbers: tuple[int, ...] | None
+    weather: tuple[str, ...] | None
+    camera_calibration: NotRequired[str | None]
+
+
+class LabelledPart(Part):
+    """Values of `labelled_frames` and, if a command has it, of `camera_calibration`."""
+
+    version: str
+
+
 labelled_frames = together(
     click.option(
         "--label-version",

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
 import pathlib
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from radejax.cli import entry
 from radejax.cli.entry import several, together
 from radejax.core.errors import UserError
+
+if TYPE_CHECKING:
+    from radejax.evaluation.files import Source
+    from radejax.evaluation.results import ReportOptions
 
 
 def _roi(text: str) -> str | tuple[float, ...]:
@@ -139,7 +142,7 @@ _OTHER_DATA = (
 @_SETTINGS
 @entry.json_option
 def evaluate(
-    run_folder: str | None, workdir: str | None, as_json: bool, **options: Any
+    run_folder: str | None, workdir: str | None, as_json: bool, **options: object
 ) -> None:
     """Evaluate a checkpoint of a run of `radejax train` on a split.
 
@@ -175,7 +178,11 @@ def evaluate(
 @_SETTINGS
 @entry.json_option
 def score(
-    predictions: str, out: str | None, name: str | None, as_json: bool, **options: Any
+    predictions: str,
+    out: str | None,
+    name: str | None,
+    as_json: bool,
+    **options: object,
 ) -> None:
     """Evaluate predictions in files.
 
@@ -189,12 +196,13 @@ def score(
     from radejax.evaluation.files import evaluate_files
     from radejax.evaluation.results import name_of_changes
 
-    path, given = pathlib.Path(predictions), _given(options)
-    source, settings = _settings(path, given, bootstrap=200)
+    path = pathlib.Path(predictions)
+    given = _given(options)
+    source, settings = _settings(predictions, given, bootstrap=200)
+    usual_source, usual_settings = _settings(predictions, {}, bootstrap=200)
+    usual = dict(usual_source) | dict(usual_settings)
     # The names of the data would be long, so they are not part of the folder's.
-    usual_source, usual_settings = _settings(path, {}, bootstrap=200)
-    usual = vars(usual_source) | vars(usual_settings)
-    names = usual.keys() - {"data", "labels", "ground_truth"}
+    names = given.keys() - {"data", "labels", "ground_truth"}
     changes = {name: value for name, value in given.items() if name in names}
     end = f"_evaluation{name_of_changes(changes, usual)}"
     folder = out or path.with_name(f"{path.stem}{end}")
@@ -212,7 +220,7 @@ def score(
 @_SETTINGS
 @entry.json_option
 def compare(
-    runs: tuple[str, ...], out: str | None, as_json: bool, **options: Any
+    runs: tuple[str, ...], out: str | None, as_json: bool, **options: object
 ) -> None:
     """Compare runs with the first of them.
 
@@ -228,7 +236,7 @@ def compare(
     entry.echo_result(as_json, rows, text.rstrip("\n"))
 
 
-def _given(options: dict[str, Any]) -> dict[str, Any]:
+def _given(options: Mapping[str, object]) -> dict[str, Any]:
     """Returns the options that were given, with None for the region "none"."""
     given = {name: value for name, value in options.items() if value is not None}
     if "sequence_numbers" in given:
@@ -238,7 +246,9 @@ def _given(options: dict[str, Any]) -> dict[str, Any]:
     return given
 
 
-def _settings(path: Any, given: dict[str, Any], bootstrap: int) -> tuple[Any, Any]:
+def _settings(
+    path: str, given: Mapping[str, Any], bootstrap: int
+) -> tuple[Source, ReportOptions]:
     """Builds `Source` and `ReportOptions` from the options that are their fields.
 
     Options that are not given are those of the report in `path` or of the ground truth.
@@ -249,11 +259,7 @@ def _settings(path: Any, given: dict[str, Any], bootstrap: int) -> tuple[Any, An
     values: dict[str, Any] = {"label_version": "v2.1"}
     for place in filter(None, (given.get("ground_truth"), path)):
         values |= stored_options(place)
-    values |= {"bootstrap": bootstrap} | given
-
-    def made(kind: Any, names: Iterable[str], values: dict[str, Any]) -> Any:
-        return kind(**{name: values[name] for name in names if name in values})
-
-    sources = [field.name for field in dataclasses.fields(Source)]
-    source = made(Source, sources, given)
-    return source, made(ReportOptions, ReportOptions.model_fields, values)
+    values |= {"bootstrap": bootstrap, **given}
+    source = {n: x for n, x in given.items() if n in Source.model_fields}
+    options = {n: x for n, x in values.items() if n in ReportOptions.model_fields}
+    return Source(**source), ReportOptions(**options)

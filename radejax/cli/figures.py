@@ -5,14 +5,19 @@ from __future__ import annotations
 import dataclasses
 import pathlib
 import tempfile
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, Unpack
 
 import click
 
 import radejax
 from radejax.cli import entry
 from radejax.core.errors import UserError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from radejax.data.kradar.dataset import Frame
 
 MODEL = pathlib.Path(__file__).with_name("demo_model")
 """Model of the quickstart with seed 0; docs/detector.md lists the commands that made it."""
@@ -49,7 +54,7 @@ def overlay(
     lidar: bool,
     roi: str,
     max_frames: int | None,
-    **part: Any,
+    **part: Unpack[entry.LabelledPart],
 ) -> None:
     """Draw one frame's labels on radar and camera: the first look at new data.
 
@@ -97,7 +102,7 @@ def overlay(
     click.echo(f"drew {out}{'' if slices else _undrawn(found)}")
 
 
-def _undrawn(frames: Any) -> str:
+def _undrawn(frames: Sequence[Frame]) -> str:
     """Says for how many frames no boxes are drawn on an image, and why."""
     images = sum(frame.camera_path is None for frame in frames)
     calibrations = sum(frame.camera_calibration_path is None for frame in frames)
@@ -109,7 +114,9 @@ def _undrawn(frames: Any) -> str:
     )
 
 
-def _draw(frames: Any, frame: Any, slices: bool, lidar: bool, roi: str) -> Any:
+def _draw(
+    frames: radejax.KRadar, frame: Frame, slices: bool, lidar: bool, roi: str
+) -> Figure:
     """Draws one frame: slices of the projection, or the radar map and camera image.
 
     Raises:
@@ -120,12 +127,11 @@ def _draw(frames: Any, frame: Any, slices: bool, lidar: bool, roi: str) -> Any:
     from radejax.data.kradar.points import read_lidar
     from radejax.visualize.draw import draw_slices
 
-    grid = frames.grid
-    fields = dict[str, Any](roi=ROIS.get(roi))
+    projection = frame.read_projection(frames.grid)
+    scene = radejax.frame_scene(frame, projection, frames.grid, roi=ROIS.get(roi))
     if lidar:
-        points_m = read_lidar(frames.lidar_path(frame))
-        fields["lidar_m"] = points_m + frame.radar_from_lidar_m
-    scene = radejax.frame_scene(frame, frame.read_projection(grid), grid, **fields)
+        points_m = read_lidar(frames.lidar_path(frame)) + frame.radar_from_lidar_m
+        scene = dataclasses.replace(scene, lidar_m=points_m)
     return draw_slices(scene) if slices else radejax.draw_frame(scene)
 
 
@@ -141,7 +147,7 @@ def view(
     out: pathlib.Path,
     workdir: str | None,
     max_frames: int | None,
-    **part: Any,
+    **part: Unpack[entry.LabelledPart],
 ) -> None:
     """Record frames, by default all, for the rerun viewer (extra "viewer").
 
@@ -175,19 +181,25 @@ def view(
     click.echo(text + _undrawn(shown))
 
 
-def viewer_scenes(frames: Any, grid: Any, detector: Any = None) -> Iterator[Any]:
+def viewer_scenes(
+    frames: Iterable[Frame],
+    grid: radejax.RadarGrid,
+    detector: radejax.Detector | None = None,
+) -> Iterator[radejax.Scene]:
     """Yields the `Scene` of each frame, which is read when it is requested.
 
     All frames must have radar data. With a detector, the scenes contain its predictions.
     """
     for frame in frames:
-        projection, time_s = frame.read_projection(grid), frame.header.timestamp_s
+        projection = frame.read_projection(grid)
+        time_s = frame.header.timestamp_s
         scene = radejax.frame_scene(frame, projection, grid, time_s=time_s)
         if detector is not None:
-            inputs = [projection]
+            image = camera = None
             if detector.takes_camera and scene.camera is not None:
-                inputs += [frame.camera_path, scene.camera]
-            found = detector(*inputs).to_boxes()
+                image = [frame.camera_path]
+                camera = scene.camera
+            found = detector(projection, image, camera).to_boxes()
             scene = dataclasses.replace(scene, predictions=found)
         yield scene
 

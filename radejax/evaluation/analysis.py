@@ -10,7 +10,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Int, Shaped
@@ -25,13 +24,14 @@ DISTANCES_M = (0.0, 20.0, 40.0, 60.0, 80.0, float("inf"))
 OPERATING_SCORE = 0.3
 """Score threshold of precision, recall and the worst frames."""
 
+Entry = dict[str, str | float]
+"""Numbers of one row of a table, and what they belong to, by name."""
+
 Masks = dict[str, tuple[Bool[np.ndarray, " N"], Bool[np.ndarray, " M"]]]
 """Masks `[N]` of the objects and `[M]` of the predictions by the name of the subset."""
 
 
-def subsets(
-    data: EvaluationSet, frames: Columns, iou: float
-) -> dict[str, list[dict[str, Any]]]:
+def subsets(data: EvaluationSet, frames: Columns, iou: float) -> dict[str, list[Entry]]:
     """Computes metrics by distance and, as far as known, weather, environment and time.
 
     Distances are measured in the ground plane. A matched prediction belongs to the
@@ -107,11 +107,13 @@ def _numbers(
 ) -> dict[str, float]:
     """Computes AP, precision, recall and counts of one class in one subset."""
     order = data.by_score[(in_pred & (data.pred.cls == cls))[data.by_score]]
-    score, is_tp = data.score[order], match[order] >= 0
+    score = data.score[order]
+    is_tp = match[order] >= 0
     num_gt = int((in_gt & (data.gt.cls == cls)).sum())
     curve = pooled_curve(score, is_tp, np.ones_like(order), num_gt, "all_point")
     above = score > OPERATING_SCORE
-    num_det, found = int(above.sum()), int(is_tp[above].sum())
+    num_det = int(above.sum())
+    found = int(is_tp[above].sum())
     return {
         "ap": curve.ap,
         "precision": found / num_det if num_det else math.nan,
@@ -141,7 +143,8 @@ def box_errors(data: EvaluationSet, iou: float) -> dict[str, dict[str, float]]:
     """
     match = data.matched_objects("plain", "free", "bev", iou)
     rows = np.flatnonzero((match >= 0) & (data.score > 0))
-    found, truth = data.pred.box[rows], data.gt.box[match[rows]]
+    found = data.pred.box[rows]
+    truth = data.gt.box[match[rows]]
     turn = np.abs(np.angle(np.exp(1j * (found[:, 6] - truth[:, 6]))))
     gap = np.abs(found - truth)
     errors = {
@@ -171,9 +174,7 @@ def _or_nan(
     return float(statistic(values)) if values.size else math.nan
 
 
-def worst_frames(
-    data: EvaluationSet, frames: Columns, iou: float
-) -> list[dict[str, Any]]:
+def worst_frames(data: EvaluationSet, frames: Columns, iou: float) -> list[Entry]:
     """Finds the frames with the most errors in 3D above the operating score.
 
     Returns:

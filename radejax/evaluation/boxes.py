@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import PathLike, atomic_write
 from radejax.core.structures import BOX_FIELDS, CLASSES, ROIS, Boxes, frame_key
+from radejax.data.dataset import LabelledFrame
 
 KNOWN_CLASSES = (*CLASSES, "Pedestrian Group", "Bicycle Group")
 """Class names that may occur in K-Radar's labels; those not evaluated are ignored."""
@@ -65,8 +66,10 @@ def in_roi(box: Real[np.ndarray, "N 7"], roi: Roi) -> Bool[np.ndarray, " N"]:
     bounds = roi_bounds(roi)
     if bounds is None:
         return np.ones(len(box), bool)
-    low, high = np.array(bounds[::2]), np.array(bounds[1::2])
-    return np.all((box[:, :3] >= low) & (box[:, :3] <= high), axis=1)
+    is_inside: Bool[np.ndarray, " N"]
+    center = box[:, :3]
+    is_inside = np.all((center >= bounds[::2]) & (center <= bounds[1::2]), axis=1)
+    return is_inside
 
 
 def roi_name(roi: Roi) -> str:
@@ -264,13 +267,12 @@ def columns_of(
 
 
 def tables_from_frames(
-    frames: Iterable[Any], split: str | None = None
+    frames: Iterable[LabelledFrame], split: str | None = None
 ) -> tuple[Boxes, Columns]:
     """Builds ground truth and frame table of a dataset such as `radejax.data.kradar.KRadar`.
 
     Args:
-        frames: Objects with sequence, name, weather, environment, time, is_simulated,
-            boxes `[N, 7]` (radar frame) and classes `[N]` (names).
+        frames: The labelled frames.
         split: Split to store in the frame table: "train", "test", "all" or a split file;
             None if it is not known.
 

@@ -20,7 +20,7 @@ import itertools
 import math
 import pathlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -28,7 +28,7 @@ from scipy.special import stdtrit
 
 from radejax.core import files
 from radejax.core.errors import UserError
-from radejax.core.files import PathLike
+from radejax.core.files import JsonObject, PathLike
 from radejax.evaluation import protocols, report
 from radejax.evaluation.analysis import distance_sets
 from radejax.evaluation.boxes import Columns
@@ -259,7 +259,7 @@ def _holm(p_values: Sequence[float]) -> list[float]:
     scaled = np.minimum(1, counts * np.asarray(p_values)[order])
     adjusted = np.empty_like(scaled)
     adjusted[order] = np.maximum.accumulate(scaled)
-    return adjusted.tolist()
+    return [float(p_value) for p_value in adjusted]
 
 
 def _check_same_truth(data_a: EvaluationSet, data_b: EvaluationSet) -> None:
@@ -321,7 +321,7 @@ def compare_files(
     out_dir: PathLike | None,
     source: Source,
     options: ReportOptions,
-) -> tuple[str, list[dict[str, Any]]]:
+) -> tuple[str, list[JsonObject]]:
     """Compares each run with the first one on the same frames.
 
     Args:
@@ -349,7 +349,8 @@ def compare_files(
     options = options.replace(min_score=max(options.min_score, *stored))
     names = [str(path) for path in paths]
     (first, frames), *others = [_load_run(run, source, options) for run in folders]
-    built, rows = [], []
+    built = []
+    rows = []
     for name, (sets, _) in zip(names[1:], others, strict=True):
         found = compare(first, sets, frames, options)
         built += comparison_tables(found, names[0], name, (len(first), len(sets)))

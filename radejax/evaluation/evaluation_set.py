@@ -84,7 +84,7 @@ class Result(Curve):
     roi: str
     label_version: str | None
     is_simulated: bool
-    condition: str
+    condition: str = "all"
     low: float | None = None
     high: float | None = None
 
@@ -132,7 +132,8 @@ def _cached(method: Callable[..., T]) -> Callable[..., T]:
         key = (method, *args)
         if key not in self._cache:
             self._cache[key] = method(self, *args)
-        return self._cache[key]
+        result: T = self._cache[key]
+        return result
 
     return cached
 
@@ -176,7 +177,8 @@ class EvaluationSet:
         found = boxes.read_boxes(predictions, "predictions", scored=True)
         boxes.require_sizes(truth, "ground truth")
         boxes.require_sizes(found, "predictions")
-        self.ground_truth, self.predictions = truth, found
+        self.ground_truth = truth
+        self.predictions = found
         if frames is None:
             frames = {"frame": np.union1d(truth.frame, found.frame)}
         self.frame = boxes.frame_ids(frames)
@@ -202,7 +204,7 @@ class EvaluationSet:
             self.pred_group, self.gt_group, self.pred.box, self.gt.box
         )
         # All protocols, thresholds and frame weights share the results of `_cached` methods.
-        self._cache: dict[tuple[Any, ...], Any] = {}
+        self._cache: dict[tuple[object, ...], Any] = {}
 
     def _select(self, table: Boxes, name: str) -> tuple[Boxes, Int[np.ndarray, " N"]]:
         """Returns the sorted boxes of the classes in the region, and their rows.
@@ -211,7 +213,8 @@ class EvaluationSet:
         """
         position = boxes.frame_positions(table.frame, self.frame, name)
         cls = boxes.class_indices(table, self.classes, name)
-        is_class, is_inside = cls >= 0, boxes.in_roi(table.box, self._roi)
+        is_class = cls >= 0
+        is_inside = boxes.in_roi(table.box, self._roi)
         num_outside = int((is_class & ~is_inside).sum())
         self.left_out[f"{name}: class not evaluated"] = int((~is_class).sum())
         self.left_out[f"{name}: center outside the region of interest"] = num_outside
@@ -227,8 +230,8 @@ class EvaluationSet:
 
     def evaluated(self, gt: Rows = ALL, pred: Rows = ALL) -> tuple[Boxes, Boxes]:
         """Returns rows of `gt` and `pred` as they were given, in the order of the input."""
-        truth, found = np.sort(self._gt_row[gt]), np.sort(self._pred_row[pred])
-        return self.ground_truth.take(truth), self.predictions.take(found)
+        truth = self.ground_truth.take(np.sort(self._gt_row[gt]))
+        return truth, self.predictions.take(np.sort(self._pred_row[pred]))
 
     def of_frames(self, is_chosen: Bool[np.ndarray, " F"]) -> EvaluationSet:
         """Returns the evaluation set of some frames, such as those of one condition."""
@@ -251,12 +254,14 @@ class EvaluationSet:
     @_cached
     def overlaps(self, geometry: str) -> dict[str, Float[np.ndarray, " P"]]:
         """Returns the IoU of the candidate pairs in the geometry of a protocol, by space."""
-        truth, found = self.gt.box, self.pred.box
+        truth = self.gt.box
+        found = self.pred.box
         if geometry != "plain":
             truth = np.round(truth, 2)
         if geometry.startswith("swapped_lw"):
             swap = [0, 1, 2, 4, 3, 5, 6]
-            truth, found = truth[:, swap], found[:, swap]
+            truth = truth[:, swap]
+            found = found[:, swap]
         z_center = 1.0 if geometry == "swapped_lw_z_top" else 0.5
         bev, volumetric = np.zeros((2, self.pair_gt.size))
         # The IoU of a pair needs about 32 temporary values.
@@ -264,16 +269,15 @@ class EvaluationSet:
             a, b = found[self.pair_pred[rows]], truth[self.pair_gt[rows]]
             area = bev_intersection(a, b)
             volume = area * shared_height(a, b, z_center)
-            area_a, area_b = a[:, 3] * a[:, 4], b[:, 3] * b[:, 4]
+            area_a = a[:, 3] * a[:, 4]
+            area_b = b[:, 3] * b[:, 4]
             volumes = area_a * a[:, 5] + area_b * b[:, 5]
             bev[rows] = area / (area_a + area_b - area)
             volumetric[rows] = volume / (volumes - volume)
         if geometry != "plain":
             # K-Radar's code stores IoUs in single precision and compares them in double.
-            bev[:], volumetric[:] = (
-                bev.astype(np.float32),
-                volumetric.astype(np.float32),
-            )
+            bev[:] = bev.astype(np.float32)
+            volumetric[:] = volumetric.astype(np.float32)
         return {"bev": bev, "3d": volumetric}
 
     def _pairs(self, geometry: str, space: str) -> matching.Pairs:
@@ -347,7 +351,6 @@ class EvaluationSet:
         spaces: Sequence[str] = SPACES,
         weights: Shaped[np.ndarray, " F"] | None = None,
         curves: bool = True,
-        condition: str = "all",
     ) -> list[Result]:
         """Computes the results of one protocol over all frames or over weighted frames.
 
@@ -361,7 +364,6 @@ class EvaluationSet:
                 None counts every frame once.
             curves: Whether to keep the precision, recall and score arrays, which take
                 much memory in many results.
-            condition: Name of the condition that the weights select.
 
         Raises:
             UserError: The protocol, a space, an IoU threshold or the empty-frame rule is
@@ -397,7 +399,6 @@ class EvaluationSet:
                     roi=self.roi,
                     label_version=self.label_version,
                     is_simulated=self.is_simulated,
-                    condition=condition,
                     **(vars(curve) | dropped),
                 )
                 results.append(result)
@@ -413,13 +414,15 @@ class EvaluationSet:
         num_gt: Sequence[int],
     ) -> Iterator[Curve]:
         """Yields the curve of each class over weighted frames, with `num_gt` objects."""
-        geometry, rule, kind = protocol.geometry, protocol.matching, protocol.curve
-        if rule == "kradar":
+        geometry = protocol.geometry
+        kind = protocol.curve
+        if protocol.matching == "kradar":
             triples = self._kradar_rankings(geometry, space, iou, threshold)
             for cls, triple in enumerate(triples):
                 matched, events, every = (x.weighted(weights[:, cls]) for x in triple)
                 yield protocols.kradar_curve(matched, events, every, num_gt[cls], kind)
             return
+        rule = protocol.matching
         rankings = self._pooled_rankings(geometry, rule, space, iou, threshold)
         for cls, (score, frame, is_tp) in enumerate(rankings):
             weight = weights[:, cls][frame]

@@ -10,15 +10,14 @@ from __future__ import annotations
 import dataclasses
 import pathlib
 from collections.abc import Iterator, Sequence
-from typing import Any
 
 import numpy as np
 
 from radejax.core import files
 from radejax.core.archives import read_npz
 from radejax.core.errors import DataError, UserError
-from radejax.core.files import PathLike
-from radejax.core.options import as_tuples
+from radejax.core.files import JsonObject, PathLike
+from radejax.core.options import Options, as_tuples
 from radejax.core.structures import BOX_FIELDS, Boxes
 from radejax.data.kradar import KRadar
 from radejax.evaluation import boxes
@@ -84,12 +83,15 @@ def _is_kitti(path: pathlib.Path) -> bool:
     return path.is_dir() and ((path / "preds").is_dir() or not any(path.glob("*.json")))
 
 
-def _records(path: pathlib.Path, scored: bool) -> Iterator[tuple[Any, ...]]:
+def _records(
+    path: pathlib.Path, scored: bool
+) -> Iterator[tuple[int | str, str, list[float], float]]:
     """Yields the checked frame, class, box and score of every record of a file."""
     content = files.read_json(path)
     for row, record in enumerate(content if isinstance(content, list) else [content]):
-        values = record if isinstance(record, dict) else {}
-        frame, cls = values.get("frame"), values.get("cls")
+        values: JsonObject = record if isinstance(record, dict) else {}
+        frame = values.get("frame")
+        cls = values.get("cls")
         box = values.get("box", [values.get(name) for name in BOX_FIELDS])
         score = values.get("score") if scored else 0.0
         numbers = [*box, score] if isinstance(box, list) else []
@@ -110,14 +112,13 @@ def _records(path: pathlib.Path, scored: bool) -> Iterator[tuple[Any, ...]]:
                 f"{path}: row {row}{without} is {record!r:.300}, expected a list of records "
                 f"with {', '.join(needed)} and numbers {', '.join(BOX_FIELDS)} (or as box)"
             )
-        yield frame, cls, box, score
+        yield values["frame"], values["cls"], box, values["score"] if scored else 0.0
 
 
 # Predictions with their ground truth --------------------------------------------------
 
 
-@dataclasses.dataclass(frozen=True)
-class Source:
+class Source(Options, section="source"):
     """Source of the ground truth and frames, and corrections of the predictions.
 
     Attributes:
@@ -166,7 +167,7 @@ def load(
     """
     path = files.as_path(path)
     if (path / "predictions.npz").is_file():
-        source = dataclasses.replace(source, ground_truth=str(path))
+        source = source.replace(ground_truth=str(path))
         path = path / "predictions.npz"
     truth, given, left_out = _load_ground_truth(path, source, classes)
     found = read_table(path, given)
@@ -238,20 +239,20 @@ def report_folders(path: PathLike) -> dict[str, pathlib.Path]:
     return found or {"": path / "evaluation" if (path / end).is_file() else path}
 
 
-def stored_options(path: PathLike) -> dict[str, Any]:
+def stored_options(path: PathLike) -> JsonObject:
     """Returns the options of the first report of a run.
 
     Without a report, they are the classes of the config in the folder or its parent, or
     none without a config.
     """
     place = next(iter(report_folders(path).values()))
-    found: dict[str, Any] = {}
+    found: JsonObject = {}
     for config in (place.parent / "config.json", place / "config.json"):
         if config.is_file():
             found = {"classes": files.read_object(config, "classes")["classes"]}
     if (place / "metrics.json").is_file():
         found = files.read_object(place / "metrics.json", "options")["options"]
-    return as_tuples(found)
+    return {name: as_tuples(value) for name, value in found.items()}
 
 
 def _read_frames(path: PathLike) -> Columns:

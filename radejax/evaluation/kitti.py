@@ -183,7 +183,8 @@ def _find_root(folder: pathlib.Path) -> pathlib.Path:
 
 def _read_folder(folder: pathlib.Path, *, scored: bool) -> tuple[list[int], Boxes]:
     """Reads the numbers of the files in a folder, which may be missing, and their boxes."""
-    numbers, rows = [], []
+    numbers = []
+    rows = []
     for path in sorted(folder.glob("*.txt")):
         if not re.fullmatch("[0-9]{1,9}", path.stem):
             raise DataError(
@@ -197,7 +198,9 @@ def _read_folder(folder: pathlib.Path, *, scored: bool) -> tuple[list[int], Boxe
     return numbers, boxes.read_boxes(table, str(folder), scored=scored)
 
 
-def _read_line(line: str, scored: bool, where: str) -> tuple | None:
+def _read_line(
+    line: str, scored: bool, where: str
+) -> tuple[str, tuple[float, ...], float] | None:
     fields = line.split()
     if not fields or fields[0] == "dummy":
         return None

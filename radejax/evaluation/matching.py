@@ -134,7 +134,9 @@ def greedy(
     number = np.cumsum(first) - 1  # [P] running number of the claimant
     rank = number - np.maximum.accumulate(np.where(new_group, number, 0))
     by_rank = np.argsort(rank, kind="stable")
-    order, first, rank = order[by_rank], first[by_rank], rank[by_rank]
+    order = order[by_rank]
+    first = first[by_rank]
+    rank = rank[by_rank]
     bounds = np.searchsorted(rank, np.arange(rank[-1] + 2))
     taken = np.zeros(num_targets, bool)
     chosen = []
@@ -224,11 +226,13 @@ def _steps(
     The matching is computed once per level, which is a distinct score in a group.
     """
     order = np.argsort(group, kind="stable")
-    (pred, gt, iou), group = pairs.take(order), group[order]
+    pred, gt, iou = pairs.take(order)
+    group = group[order]
     # Levels: distinct (group, score), by descending score.
     start = np.lexsort((pred, -score[pred], group))
     start = start[_is_new(group[start], score[pred[start]])]
-    level_pred, level_group = pred[start], group[start]
+    level_pred = pred[start]
+    level_group = group[start]
     first = np.searchsorted(group, level_group)
     count = np.searchsorted(group, level_group, side="right") - first
     true_positives = np.zeros(level_pred.size, np.int64)

@@ -168,7 +168,8 @@ def score_thresholds(
     # with the original rounding in a window around this value.
     low = np.maximum(np.ceil(current * num_gt - 1.5).astype(np.int64) - 4, 0)
     index = low[:, None] + np.arange(9)
-    left, right = (index + 1) / num_gt, (index + 2) / num_gt
+    left = (index + 1) / num_gt
+    right = (index + 2) / num_gt
     skipped = (right - current[:, None]) < (current[:, None] - left)
     crossing = np.minimum(low + skipped.sum(axis=1), total - 1)
     steps = np.arange(crossing.size)
@@ -251,7 +252,9 @@ def pooled_curve(
         83.33
     """
     counts = weight > 0  # an excluded frame must not leave a point at recall 0
-    score, is_tp, weight = score[counts], is_tp[counts], weight[counts]
+    score = score[counts]
+    is_tp = is_tp[counts]
+    weight = weight[counts]
     num_det = int(weight.sum())
     found = np.cumsum(is_tp * weight)
     made = np.cumsum(weight)
@@ -259,10 +262,13 @@ def pooled_curve(
         # Equal scores are one threshold, so that their order does not matter.
         last = np.ones(score.size, bool)
         last[:-1] = score[1:] != score[:-1]
-        found, made, score = found[last], made[last], score[last]
-        precision, recall = found / made, found / max(num_gt, 1)
+        score = score[last]
+        found = found[last]
+        precision = found / made[last]
+        recall = found / max(num_gt, 1)
     else:
-        precision, recall = found / (made + EPSILON), found / (num_gt + EPSILON)
+        precision = found / (made + EPSILON)
+        recall = found / (num_gt + EPSILON)
     if num_gt == 0:
         ap = float("nan")
     elif num_det == 0:

@@ -25,13 +25,14 @@ import json
 import pathlib
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypedDict
 
 import numpy as np
+from jaxtyping import Bool
 from tabulate import LATEX_ESCAPE_RULES, tabulate
 
 from radejax.core import files
-from radejax.core.files import PathLike
+from radejax.core.files import JsonObject, PathLike
 from radejax.data.kradar.conditions import WEATHERS
 from radejax.evaluation import analysis, protocols
 from radejax.evaluation.boxes import AnyBoxes, Columns, roi_name, write_boxes
@@ -59,7 +60,7 @@ class Report:
     """
 
     text: str
-    metrics: dict[str, Any]
+    metrics: JsonObject
     results: list[Result]
     folder: pathlib.Path
 
@@ -105,7 +106,7 @@ def write_report(
     }
     # The split is that of all frames, or None if it is unknown or differs.
     splits = np.unique(np.asarray(frames.get("split", [])).astype(str))
-    metrics = {
+    found = {
         "run": run,
         "options": options.to_dict(),
         "split": splits.item() if splits.size == 1 else None,
@@ -123,7 +124,7 @@ def write_report(
         "box_errors": analysis.box_errors(data, iou),
         "worst_frames": analysis.worst_frames(data, frames, iou),
     }
-    metrics = plain(metrics)
+    metrics = plain(found)
     by_key = {result.key: result for result in results}
     tables = RunTables(run, by_key, options, metrics["split"])
     text = _console_text(metrics, tables)
@@ -155,7 +156,7 @@ def write_report(
     return Report(text, metrics, results, pathlib.Path(out_dir))
 
 
-def _all_tables(metrics: Mapping[str, Any], tables: RunTables) -> list[Table]:
+def _all_tables(metrics: JsonObject, tables: RunTables) -> list[Table]:
     """Builds the tables in the papers' layouts, of all protocols and IoUs, and of details."""
     options = tables.options
     subsets = metrics["subsets"]
@@ -173,7 +174,7 @@ def _all_tables(metrics: Mapping[str, Any], tables: RunTables) -> list[Table]:
     return [*built, worst]
 
 
-def _console_text(metrics: Mapping[str, Any], tables: RunTables) -> str:
+def _console_text(metrics: JsonObject, tables: RunTables) -> str:
     """Formats the most important tables for the console."""
     options = tables.options
     iou = options.iou_thresholds[0]
@@ -206,18 +207,24 @@ def _draw_curves(
 ) -> None:
     """Draws precision over recall for each class with objects, one curve per weather."""
     # Imported here, as matplotlib takes a second to load and is not always needed.
-    from radejax.visualize.curves import draw_precision_recall
+    from radejax.visualize.curves import Curve, draw_precision_recall
     from radejax.visualize.style import save_figure
 
     protocol = protocols.RECOMMENDED
     iou = options.iou_thresholds[0]
     suffix = ", simulated data" if data.is_simulated else ""
-    masks: dict[str, Any] = {"all": None, **condition_masks(frames, "weather")}
-    settings = {"iou_thresholds": iou, **options.settings_of(protocol)}
+    masks: dict[str, Bool[np.ndarray, " F"] | None] = {"all": None}
+    masks |= condition_masks(frames, "weather")
     for space in SPACES:
-        panels: dict[str, dict[str, Any]] = {}
+        panels: dict[str, dict[str, Curve]] = {}
         for name, mask in masks.items():
-            results = data.results(protocol, spaces=space, weights=mask, **settings)
+            results = data.results(
+                protocol,
+                iou_thresholds=iou,
+                spaces=space,
+                weights=mask,
+                **options.settings_of(protocol),
+            )
             for result in results:
                 title = f"{result.cls}, {protocol}, {space}, IoU {iou:g}{suffix}"
                 curve = (result.recall, result.precision) if result.is_defined else None
@@ -229,9 +236,12 @@ def _draw_curves(
         save_figure(figure, folder / name)
 
 
-def plain(value: Any) -> Any:
+def plain(values: JsonObject) -> JsonObject:
     """Converts values to strict JSON: NaN and infinity become null."""
-    return json.loads(json.dumps(value), parse_constant=lambda name: None)
+    strict: JsonObject = json.loads(
+        json.dumps(values), parse_constant=lambda name: None
+    )
+    return strict
 
 
 # Tables -------------------------------------------------------------------------------
@@ -286,10 +296,13 @@ def rendered(
     return "\n".join(table.render(style, is_simulated=is_simulated) for table in tables)
 
 
-def write_tables(path: pathlib.Path, tables: Sequence[Table], **options: Any) -> None:
+def write_tables(
+    path: pathlib.Path, tables: Sequence[Table], *, is_simulated: bool
+) -> None:
     """Writes tables as Markdown and LaTeX to files with these suffixes, see `rendered`."""
     for suffix, style in ((".md", "markdown"), (".tex", "latex")):
-        files.write_text(path.with_suffix(suffix), rendered(tables, style, **options))
+        text = rendered(tables, style, is_simulated=is_simulated)
+        files.write_text(path.with_suffix(suffix), text)
 
 
 def number(value: float | None, *, signed: bool = False, digits: int = 2) -> str:
@@ -299,23 +312,24 @@ def number(value: float | None, *, signed: bool = False, digits: int = 2) -> str
     return f"{value:+.{digits}f}" if signed else f"{value:.{digits}f}"
 
 
-def numbers(values: Iterable[float | None], **options: Any) -> list[str]:
+def numbers(values: Iterable[float | None], *, signed: bool = False) -> list[str]:
     """Formats values as table entries (see `number`)."""
-    return [number(value, **options) for value in values]
+    return [number(value, signed=signed) for value in values]
 
 
 def _with_interval(result: Result) -> str:
     """Formats an AP with its interval, if there is one, such as "61.05 [50.1, 70.2]"."""
     if not (result.is_defined and result.has_interval):
         return number(result.ap_or_none)
-    low, high = numbers((result.low, result.high), digits=1)
+    low = number(result.low, digits=1)
+    high = number(result.high, digits=1)
     return f"{number(result.ap)} [{low}, {high}]"
 
 
 # Behind the APs -----------------------------------------------------------------------
 
 
-def subset_table(subsets: Mapping[str, Any], kind: str) -> Table:
+def subset_table(subsets: JsonObject, kind: str) -> Table:
     """Builds the table of AP, precision and recall per subset and class with boxes."""
     title = f"By {kind}, {subsets['protocol']}"
     entries = [entry for entry in subsets[kind] if entry["num_gt"] or entry["num_det"]]
@@ -325,6 +339,7 @@ def subset_table(subsets: Mapping[str, Any], kind: str) -> Table:
 
 def error_table(errors: Mapping[str, Mapping[str, float]]) -> Table:
     """Builds the table of median errors of matched boxes and of reversed headings."""
+    entries: list[analysis.Entry]
     entries = [{"cls": cls, **found} for cls, found in errors.items()]
     medians = [name for name in entries[0] if name.endswith("_median")]
     title = "Median errors of matched boxes (all scores); reversed: heading off by more"
@@ -333,7 +348,7 @@ def error_table(errors: Mapping[str, Mapping[str, float]]) -> Table:
 
 
 def _table_of(
-    title: str, entries: Sequence[Mapping[str, Any]], names: Sequence[str]
+    title: str, entries: Sequence[analysis.Entry], names: Sequence[str]
 ) -> Table:
     """Builds a table with some values of entries of metrics.json, one entry per row."""
     values = [[entry.get(name, "") for name in names] for entry in entries]
@@ -441,8 +456,14 @@ PUBLISHED = _read()
 
 # Tables of a run ----------------------------------------------------------------------
 
-Place = Mapping[str, Any]
-"""Fields of a `Cell` by name."""
+
+class Place(TypedDict, total=False):
+    """Fields of a `Cell` by name."""
+
+    condition: str
+    cls: str
+    space: str
+    iou: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -507,8 +528,9 @@ class RunTables:
         if 0.3 not in self.options.iou_thresholds:
             return []
         spaces: list[Place] = [{"space": space} for space in SPACES]
-        conditions = [{"condition": name} for name in CONDITIONS]
-        classes = [{"cls": cls} for cls in (*self.options.classes, "mean")]
+        conditions: list[Place] = [{"condition": name} for name in CONDITIONS]
+        names = (*self.options.classes, "mean")
+        classes: list[Place] = [{"cls": name} for name in names]
         of_others = ("Sedan", "Bus or Truck", "mean")  # classes of most other methods
         common = [place for place in classes if place["cls"] in of_others]
         ious = _crossed([{"iou": 0.3}, {"iou": 0.5}], spaces)
@@ -566,7 +588,7 @@ class RunTables:
         body: list[list[str]] = []
         for group in groups:
             of = _name(group)
-            cells = [Cell(**group, **column) for column in columns]
+            cells = [Cell(**(group | column)) for column in columns]
             printed = []
             for row in PUBLISHED:
                 values = [row.values.get(cell, "-") for cell in cells]
@@ -605,10 +627,11 @@ class RunTables:
 
 
 def _crossed(outer: Sequence[Place], inner: Sequence[Place]) -> list[Place]:
-    return [{**one, **other} for one in outer for other in inner]
+    return [one | other for one in outer for other in inner]
 
 
 def _name(place: Place) -> str:
     """Returns the title of a group or a column, such as "Light Snow BEV"."""
+    names: dict[object, str]
     names = {"3d": "3D", "bev": "BEV", 0.3: "IoU 0.3", 0.5: "IoU 0.5"} | TITLES
     return " ".join(str(names.get(value, value)) for value in place.values())

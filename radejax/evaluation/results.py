@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal, TypedDict
 
 import numpy as np
 import pydantic
@@ -19,6 +19,7 @@ from annotated_types import MinLen
 from jaxtyping import Bool, Float, Int, Shaped
 
 from radejax.core.errors import UserError, require
+from radejax.core.files import JsonObject
 from radejax.core.options import AtLeastOne, BelowOne, Count, Fraction, Options
 from radejax.core.structures import CLASSES, MIN_SIZE_M, NARROW_ROI, Boxes
 from radejax.data.kradar.conditions import WEATHERS
@@ -86,8 +87,19 @@ class EvaluationOptions(Options, section="config.evaluation"):
             raise UserError(f"config.evaluation.{error}") from None
 
 
+class Settings(TypedDict):
+    """Settings of one protocol in a report, see `evaluate`."""
+
+    score_threshold: float
+    empty_frames: str
+
+
 class ReportOptions(EvaluationOptions):
-    """Options of one report, which may be of boxes without a run."""
+    """Options of one report, which may be of boxes without a run.
+
+    The defaults are for boxes in files: all of them count, in every protocol. A run stores
+    and evaluates less, see `runs.evaluate.report_options`.
+    """
 
     iou_thresholds: Thresholds = (0.3, 0.5, 0.7)
     """IoU thresholds."""
@@ -125,7 +137,7 @@ class ReportOptions(EvaluationOptions):
         shown = protocols.RECOMMENDED, "kradar_r40", self.paper_protocol
         return tuple(name for name in dict.fromkeys(shown) if name in self.protocols)
 
-    def settings_of(self, protocol: str) -> dict[str, Any]:
+    def settings_of(self, protocol: str) -> Settings:
         """Returns the score threshold and empty-frame rule of a protocol for `results`."""
         if protocols.get_protocol(protocol).is_fixed:
             return {"score_threshold": self.min_score, "empty_frames": "protocol"}
@@ -139,7 +151,7 @@ SAME_NUMBERS = frozenset(
 """Options of an evaluation that do not change its APs."""
 
 
-def name_of_changes(changes: Mapping[str, Any], usual: Mapping[str, Any]) -> str:
+def name_of_changes(changes: Mapping[str, object], usual: Mapping[str, object]) -> str:
     """Returns the end of a folder's name for options that change APs: `_roi_wide`.
 
     Args:
@@ -227,7 +239,6 @@ def compute_results(
                 iou_thresholds=options.iou_thresholds,
                 weights=mask,
                 curves=False,
-                condition=condition,
                 **settings,
             )
             for start in range(0, len(results), len(data.classes)):
@@ -242,7 +253,7 @@ def compute_results(
                         dataclasses.replace(row, low=low, high=high)
                         for row, (low, high) in pairs
                     ]
-                rows += group
+                rows += [dataclasses.replace(row, condition=condition) for row in group]
     # The results are sorted by protocol, then by condition.
     return sorted(rows, key=lambda row: options.protocols.index(row.protocol))
 
@@ -288,17 +299,26 @@ def resample(
     protocol: str,
     space: str,
     iou: float,
-    **settings: Any,
+    *,
+    score_threshold: float = 0.0,
+    empty_frames: str = "protocol",
 ) -> Float[np.ndarray, "B _"]:
     """Computes `[B, C + 1]` APs of every class and their mean in every resample.
 
     The AP is NaN if a resample has no object of the class. The mean is over the classes
-    that occur. `settings` are further arguments of `EvaluationSet.results`.
+    that occur. The other arguments are those of `EvaluationSet.results`.
     """
-    settings |= {"iou_thresholds": iou, "spaces": space}
     samples = []
     for weight in weights:
-        results = data.results(protocol, weights=weight, curves=False, **settings)
+        results = data.results(
+            protocol,
+            iou_thresholds=iou,
+            empty_frames=empty_frames,
+            score_threshold=score_threshold,
+            spaces=space,
+            weights=weight,
+            curves=False,
+        )
         samples.append([*(result.ap_or_none for result in results), mean_ap(results)])
     return np.array(samples, np.float64)  # None becomes NaN
 
@@ -377,7 +397,7 @@ def repair_sizes(predictions: AnyBoxes, rule: str) -> tuple[Boxes, int]:
     return dataclasses.replace(found, box=box), int(is_invalid.sum())
 
 
-def to_row(result: Result) -> dict[str, Any]:
+def to_row(result: Result) -> JsonObject:
     """Converts a result to one row of metrics.json and metrics.csv."""
     others = ["ap", "precision", "recall", "score", "low", "high", "is_simulated"]
     terms = {name: value for name, value in vars(result).items() if name not in others}

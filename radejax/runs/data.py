@@ -22,6 +22,7 @@ from radejax.data import cameras, pipeline, records
 from radejax.data.augment import Augmentation
 from radejax.data.dataset import (
     FrameSequence,
+    LabelledFrame,
     LabelledFrames,
     find_reader,
     held_out,
@@ -73,7 +74,7 @@ class Data:
         self.camera: CameraOptions | None = None
         self.features: Records | None = None
         self._skipped = set[str]()
-        self._splits: dict[str, LabelledFrames] = {}
+        self._splits: dict[str, LabelledFrames[LabelledFrame]] = {}
         image = None
         if isinstance(config.model, DinoRadeOptions):
             self.camera = options.used_camera
@@ -117,7 +118,9 @@ class Data:
         """Projections of the frames, on their grid."""
         return records.open_projections(self._records_folder, self.frames.grid)
 
-    def split(self, name: str, *, may_be_empty: bool = False) -> LabelledFrames:
+    def split(
+        self, name: str, *, may_be_empty: bool = False
+    ) -> LabelledFrames[LabelledFrame]:
         """Return the frames of a split.
 
         Frames that `preprocess` skipped are left out and counted. The sequences that
@@ -147,11 +150,13 @@ class Data:
             raise UserError(f"no frames of the {name} split in {roots}")
         return self._splits[name]
 
-    def _chosen(self, frames: LabelledFrames) -> LabelledFrames:
+    def _chosen(
+        self, frames: LabelledFrames[LabelledFrame]
+    ) -> LabelledFrames[LabelledFrame]:
         """Return the frames of the chosen sequences and weathers."""
         return frames.part(self.options.sequences, self.options.weather)
 
-    def _part_of_train(self, name: str) -> LabelledFrames:
+    def _part_of_train(self, name: str) -> LabelledFrames[LabelledFrame]:
         """Return the part of the train split that is trained on, or is held out.
 
         Args:
@@ -206,7 +211,8 @@ class Data:
             UserError: Images or calibrations are missing or of another size, no frame has
                 a usable image, or there are fewer frames than one batch needs.
         """
-        images, options = self.images(frames), self.options
+        options = self.options
+        images = self.images(frames)
         cameras.require_images(frames, images)
         table = pipeline.make_table(
             self.records,
@@ -354,7 +360,8 @@ def _log_input(data: Data, model: RadeNetOptions) -> None:
     frames = list(data.split("train"))
     some = frames[:: -(-len(frames) // _INPUT_FRAMES)]
     values = np.stack([decode(data.records[frame.key]) for frame in some])
-    mean, spread = float(values.mean()), float(values.std())
+    mean = float(values.mean())
+    spread = float(values.std())
     _log.info("input: %.3f ± %.3f in %d frames to train on", mean, spread, len(some))
     seen = model.input_scale * (mean - model.input_center)
     is_unusual = abs(seen - _KRADAR_INPUT) > 0.1
@@ -386,7 +393,8 @@ def data_of_run(
             radar grid.
         FileNotFoundError: A folder is missing.
     """
-    changes, own = dict(changes or {}), saved.config.data.roots
+    own = saved.config.data.roots
+    changes = dict(changes or {})
     roots = changes.pop("roots", own)
     if not roots:
         raise UserError(

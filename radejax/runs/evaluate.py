@@ -10,12 +10,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from flax.typing import VariableDict
 from jax.sharding import Mesh
 from matplotlib.figure import Figure
 
 from radejax.config import Config
 from radejax.core import devices, files
 from radejax.core.errors import UserError
+from radejax.core.files import JsonObject, PathLike
 from radejax.core.structures import Boxes
 from radejax.data.cameras import require_images
 from radejax.data.dataset import FrameSequence, LabelledFrame, find_reader
@@ -32,7 +34,7 @@ from radejax.evaluation.results import (
 from radejax.inference.detector import Detector
 from radejax.inference.inputs import check_backbone
 from radejax.inference.predict import predict_dataset
-from radejax.inference.saved import PathLike, SavedModel, Step, load_model
+from radejax.inference.saved import SavedModel, Step, load_model
 from radejax.runs import figures
 from radejax.runs.data import Data, data_name, data_of_run
 from radejax.training.metric_writer import Scores
@@ -54,7 +56,7 @@ class Evaluation:
         split: "test", "validation", "train", "all" or the path of a split file.
         shuffle_images: Seed for shuffling the images, or None; see `evaluate_run`.
         mesh: Devices of all processes, see `make_mesh`; all if None.
-        **changes: Fields of `ReportOptions` to replace.
+        options: Settings of the evaluation; those of the config if None.
 
     Raises:
         UserError: The split has no frames, or too few images to shuffle.
@@ -68,12 +70,12 @@ class Evaluation:
         *,
         shuffle_images: int | None = None,
         mesh: Mesh | None = None,
-        **changes: Any,
+        options: ReportOptions | None = None,
     ) -> None:
         self._config = config
         self._data = data
         self._split = split
-        options = self._options = report_options(config, **changes)
+        self._options = report_options(config) if options is None else options
         self._source = source_of(data, split, shuffle_images)
         self._frames = data.split(split)
         self._seen: FrameSequence = self._frames
@@ -84,14 +86,23 @@ class Evaluation:
         saved = SavedModel(config, data.records.grid, {})
         mesh = devices.make_mesh() if mesh is None else mesh
         placement = devices.batch_sharding(mesh)
-        self._detector = Detector(saved, placement, score_threshold=options.min_score)
+        least = self._options.min_score
+        self._detector = Detector(saved, placement, score_threshold=least)
 
-    def predict(self, variables: Mapping[str, Any], **options: Any) -> Boxes:
+    def predict(
+        self,
+        variables: VariableDict,
+        *,
+        progress: bool = True,
+        should_stop: Callable[[], bool] | None = None,
+    ) -> Boxes:
         """Detect objects in all frames of the split.
 
         Args:
             variables: Variables of the model.
-            **options: Keyword arguments of `predict_dataset`.
+            progress: Whether to show a progress bar.
+            should_stop: Function that is called before every batch; returning True ends
+                the evaluation.
 
         Returns:
             Boxes whose score reaches `min_score`, see `predict_dataset`.
@@ -102,12 +113,13 @@ class Evaluation:
             self._seen,
             self._options.batch_size,
             images=self._images,
-            **options,
+            progress=progress,
+            should_stop=should_stop,
         )
 
     def validate(
         self,
-        variables: Mapping[str, Any],
+        variables: VariableDict,
         should_stop: Callable[[], bool] | None = None,
     ) -> Scores:
         """Evaluate the variables of a model during training.
@@ -136,7 +148,7 @@ class Evaluation:
 
     def report(
         self,
-        variables: Mapping[str, Any],
+        variables: VariableDict,
         workdir: pathlib.Path,
         *,
         out: pathlib.Path | None = None,
@@ -155,7 +167,8 @@ class Evaluation:
         Returns:
             The report that was written; None on all processes except the first.
         """
-        predictions, place = self.predict(variables), out or workdir / "evaluation"
+        predictions = self.predict(variables)
+        place = out or workdir / "evaluation"
 
         def write() -> Report:
             with files.swapped_in(place) as folder:
@@ -178,9 +191,7 @@ class Evaluation:
 
         return devices.main_only(write)
 
-    def _write_camera_share(
-        self, variables: Mapping[str, Any], path: pathlib.Path
-    ) -> None:
+    def _write_camera_share(self, variables: VariableDict, path: pathlib.Path) -> None:
         """Write the mean weight of the camera by weather, computed on up to 256 frames."""
         some = figures.spread(self._frames, 256)
         maps = figures.frame_shares(self._detector.model, variables, self._data, some)
@@ -206,7 +217,10 @@ class Evaluation:
                 save_figure(figure, folder / kind / f"{name}.{ending}")
         if usual:  # the layout of RADE-Net's Figure 4
             scenes = [
-                self._scene(predictions, i, title=f"{name} ({frames[i].key}){suffix}")
+                dataclasses.replace(
+                    self._scene(predictions, i),
+                    title=f"{name} ({frames[i].key}){suffix}",
+                )
                 for name, i in figures.fullest_of_weathers(frames).items()
             ]
             save_figure(draw_scenes(scenes), folder / f"scenes.{ending}")
@@ -216,7 +230,7 @@ class Evaluation:
                 figure = curves.draw_training(series, losses, workdir.name + suffix)
                 save_figure(figure, folder / f"training.{ending}")
 
-    def _scene(self, predictions: Boxes, index: int, **fields: Any) -> Scene:
+    def _scene(self, predictions: Boxes, index: int) -> Scene:
         """Return the scene of a frame with its boxes and image.
 
         Predictions are drawn if their score reaches `config.decode.score_threshold`, the
@@ -234,7 +248,6 @@ class Evaluation:
             predictions=predictions.take(is_drawn),
             roi=roi_bounds(self._options.roi),
             score_threshold=threshold,
-            **fields,
         )
 
     def _spread(self, count: int) -> list[int]:
@@ -298,7 +311,6 @@ def evaluate_run(
     shuffle_images: int | None = None,
     other: Mapping[str, Any] | None = None,
     run: str | None = None,
-    mesh: Mesh | None = None,
     **changes: Any,
 ) -> Report | None:
     """Evaluate a checkpoint of a run with the settings of its config, on all devices.
@@ -316,7 +328,6 @@ def evaluate_run(
             radar-camera model uses the images.
         other: Fields of `config.data` to replace, such as `{"roots": ("/data",)}`.
         run: Name of the run in the report; the workdir's name if None.
-        mesh: Devices of all processes, see `make_mesh`; all if None.
         **changes: Fields of `ReportOptions` to replace.
 
     Returns:
@@ -333,8 +344,7 @@ def evaluate_run(
     if not saved.run:
         raise UserError(f"{workdir} is not a run: give a workdir of train.py")
     usual = report_options(saved.config)
-    # This fails before labels are read, which takes long.
-    report_options(saved.config, **changes)
+    options = report_options(saved.config, **changes)
     config, data = data_of_run(saved, other)
     name = "evaluation" if other is None else f"evaluation_{data_name(other)}"
     name += "" if split == "test" else f"_{files.as_path(split).stem}"
@@ -359,7 +369,7 @@ def evaluate_run(
             _check_source(workdir / name, source_of(data, split, shuffle_images))
     data.preprocess()
     evaluation = Evaluation(
-        config, data, split, shuffle_images=shuffle_images, mesh=mesh, **changes
+        config, data, split, shuffle_images=shuffle_images, options=options
     )
     place = files.as_path(out or workdir / name)
     return evaluation.report(
@@ -367,9 +377,7 @@ def evaluate_run(
     )
 
 
-def source_of(
-    data: Data, split: str, shuffle_images: int | None = None
-) -> dict[str, Any]:
+def source_of(data: Data, split: str, shuffle_images: int | None = None) -> JsonObject:
     """Return a description of the data and split of results as plain values."""
     return {
         "split": split,
@@ -379,7 +387,7 @@ def source_of(
     }
 
 
-def _check_source(out: pathlib.Path, source: Mapping[str, Any]) -> None:
+def _check_source(out: pathlib.Path, source: JsonObject) -> None:
     """Raise `UserError` if a folder contains results on other data than `source`."""
     if not (out / "source.json").exists():
         return
@@ -413,9 +421,8 @@ def with_shuffled_images(data: Data, split: str, seed: int) -> list[LabelledFram
     order = np.random.default_rng(seed).permutation(given)
     shuffled = list(frames)
     for own, other in zip(order, np.roll(order, 1), strict=True):
-        frame: Any = frames[own]
         shuffled[own] = dataclasses.replace(
-            frame,
+            frames[own],
             camera_path=frames[other].camera_path,
             camera_calibration_path=frames[other].camera_calibration_path,
         )

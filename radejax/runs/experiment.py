@@ -23,21 +23,21 @@ import logging
 import pathlib
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
 
 import flax.linen as nn
 import grain
 import jax
 import numpy as np
-from jax.sharding import Mesh
+from jax.sharding import Mesh, NamedSharding
+from jaxtyping import PyTree
 
 import radejax
 from radejax import models
 from radejax.config import Config
 from radejax.core import devices, files
 from radejax.core.errors import require
-from radejax.core.files import PathLike
+from radejax.core.files import JsonObject, PathLike
 from radejax.core.structures import Batch
 from radejax.data.dataset import FrameSequence
 from radejax.data.records import open_embeddings
@@ -71,7 +71,7 @@ def run(
     workdir: PathLike,
     *,
     init_from: PathLike | None = None,
-    profile: PathLike = "",
+    profile: PathLike | None = None,
     mesh: Mesh | None = None,
 ) -> pathlib.Path:
     """Trains and evaluates a model, or continues an interrupted run.
@@ -82,7 +82,7 @@ def run(
         init_from: Weights to start from: an official checkpoint file, another workdir, or
             another model that `load_model` accepts.
         profile: Folder for a profiler trace of the steps `config.logging.profile_steps`;
-            empty for no trace.
+            None for no trace.
         mesh: Devices of the run, see `make_mesh`; all if None.
 
     Returns:
@@ -116,7 +116,8 @@ def run(
         # Data -------------------------------------------------------------------------
 
         data = open_data(config)
-        frames, grid = data.split("train"), data.records.grid
+        frames = data.split("train")
+        grid = data.records.grid
         has_test = len(data.split("test", may_be_empty=True)) > 0
         if not has_test:
             _log.warning(
@@ -158,7 +159,7 @@ def run(
                 pretrained=pretrained,
             ),
             validate=validate,
-            profile=str(profile),
+            profile=profile,
         )
         step = int(state.step)
         if not is_finished:
@@ -210,7 +211,7 @@ class TrainingData:
     batches: grain.DatasetIterator[Batch]
     steps_per_epoch: int
     grid: RadarGrid
-    info: Mapping[str, Any]
+    info: JsonObject
 
 
 def fit(
@@ -222,7 +223,7 @@ def fit(
     *,
     initial: Callable[[Batch], Variables] | None = None,
     validate: Validate | None = None,
-    profile: str = "",
+    profile: PathLike | None = None,
 ) -> tuple[TrainState, bool]:
     """Trains a model for the configured epochs or steps, or continues from a checkpoint.
 
@@ -238,7 +239,7 @@ def fit(
         validate: Function that is called every `evaluate_every_epochs` epochs and, unless
             this field is 0, after the last step, see `Evaluation.validate`.
         profile: Folder for a profiler trace of the steps `config.logging.profile_steps`,
-            counted from the first step of this call.
+            counted from the first step of this call; None for no trace.
 
     Returns:
         The state, placed on all devices, and whether the training is finished. It is not
@@ -289,8 +290,9 @@ def fit(
             called.append(due(epochs * data.steps_per_epoch, evaluate))
         called.append(due(log_every_steps, check))
         called.append(due(config.train.checkpoint_every_steps, save))
-        if profile:
-            trace = hooks.Trace(profile, start, num_steps, config.logging.profile_steps)
+        if profile is not None:
+            shown = config.logging.profile_steps
+            trace = hooks.Trace(str(profile), start, num_steps, shown)
             called.append(stack.enter_context(trace))
 
         state = loop.train(
@@ -325,7 +327,7 @@ def _make_state_and_step(
     def create(variables: Variables) -> TrainState:
         return create_state(variables, optimizer, use_ema=use_ema, is_frozen=is_frozen)
 
-    def place(state: TrainState) -> Any:
+    def place(state: TrainState) -> PyTree[NamedSharding]:
         return devices.state_sharding(state, mesh, train.parameter_sharding)
 
     state = loop.restore_or_initialize(
@@ -381,9 +383,7 @@ def claimed(workdir: pathlib.Path, config: Config) -> Iterator[None]:
         yield
 
 
-def run_info(
-    workdir: pathlib.Path, init_from: PathLike | None = None
-) -> dict[str, Any]:
+def run_info(workdir: pathlib.Path, init_from: PathLike | None = None) -> JsonObject:
     """Returns the versions, device, command and starting weights of a run as plain values.
 
     Args:
@@ -407,9 +407,9 @@ def run_info(
 def checkpoint_info(
     config: Config,
     grid: RadarGrid,
-    run: Mapping[str, Any],
-    same: Mapping[str, Any],
-) -> dict[str, Any]:
+    run: JsonObject,
+    same: JsonObject,
+) -> JsonObject:
     """Returns the plain values in every checkpoint of a run, which `inference.saved` reads.
 
     Args:
@@ -419,10 +419,10 @@ def checkpoint_info(
         same: Values by name that must not change when the run continues.
     """
     values = {"config": config.model_dump(mode="json"), "grid": grid.to_dict()}
-    return {**values, "run": dict(run), "same": dict(same)}
+    return {**values, "run": run, "same": same}
 
 
-def _invariants(frames: FrameSequence, frozen_sha256: str | None) -> dict[str, Any]:
+def _invariants(frames: FrameSequence, frozen_sha256: str | None) -> JsonObject:
     """Returns properties of the data and frozen weights that a run must not change.
 
     Folders may move. Therefore frames are identified by their keys, and the frozen
@@ -442,7 +442,12 @@ _KEYS = ("name", "protocol", "score_threshold", "condition", "cls", "space", "io
 
 
 def run_seeds(
-    config: Config, workdir: PathLike, seeds: Sequence[int], **options: Any
+    config: Config,
+    workdir: PathLike,
+    seeds: Sequence[int],
+    *,
+    init_from: PathLike | None = None,
+    profile: PathLike | None = None,
 ) -> pathlib.Path:
     """Runs a config with several seeds, one after the other.
 
@@ -455,7 +460,8 @@ def run_seeds(
         config: Config of the runs.
         workdir: Folder of the runs `seed0`, `seed1`, ... and the summary.
         seeds: Seeds, all different.
-        **options: Further arguments of `run`.
+        init_from: See `run`.
+        profile: See `run`.
 
     Returns:
         The absolute path of the workdir. Its files `seeds.json`, `seeds.txt`,
@@ -470,7 +476,12 @@ def run_seeds(
     tables = {}
     for seed in seeds:
         _log.info("seed %d of %s", seed, list(seeds))
-        folder = run(config.replace(seed=seed), workdir / f"seed{seed}", **options)
+        folder = run(
+            config.replace(seed=seed),
+            workdir / f"seed{seed}",
+            init_from=init_from,
+            profile=profile,
+        )
         metrics = folder / "evaluation" / "metrics.csv"
         if not metrics.exists():
             _log.info("seed %d is not evaluated: it is not finished, or no data", seed)
@@ -497,13 +508,13 @@ def _write_summary(
         workdir: Folder of `seeds.json`, `seeds.txt`, `seeds.md` and `seeds.tex`.
         tables: APs by seed and by the values of `_KEYS`.
     """
-    rows = list[dict[str, Any]]()
+    rows = list[JsonObject]()
     lines = []
     first, *others = tables.values()
     for key in (key for key in first if all(key in table for table in others)):
         values = {seed: table[key] for seed, table in tables.items()}
         aps = list(values.values())
-        row: dict[str, Any] = dict(zip(_KEYS, key, strict=True))
+        row: JsonObject = dict(zip(_KEYS, key, strict=True))
         row["mean"] = float(np.mean(aps))
         row["std"] = float(np.std(aps, ddof=1)) if others else None
         rows.append({**row, "values": values})

@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from flax.typing import VariableDict
+from jaxtyping import Float, PyTree
+from numpy.typing import ArrayLike
 
-from radejax.core.structures import Boxes
+from radejax.core.files import JsonObject
+from radejax.core.structures import Array, Boxes
 from radejax.data.cameras import front_view
 from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.pipeline import read_sample, sample_keys
 from radejax.data.projection import decode
 from radejax.evaluation.results import condition_masks
 from radejax.geometry.radar_grid import RadarGrid
+from radejax.models.dinorade import DinoRade
 from radejax.runs.data import Data
 from radejax.visualize.style import Scene
 
+T = TypeVar("T")
+
 
 def frame_scene(
-    frame: LabelledFrame, projection: Any, grid: RadarGrid, **fields: Any
+    frame: LabelledFrame, projection: ArrayLike, grid: RadarGrid, **fields: Any
 ) -> Scene:
     """Create the scene of a labelled frame with its boxes, image, calibration and title.
 
@@ -50,15 +56,15 @@ def fullest_of_weathers(frames: FrameSequence) -> dict[str, int]:
     return {name: int(np.where(m, counts, -1).argmax()) for name, m in masks.items()}
 
 
-def spread(values: Any, count: int) -> list[Any]:
+def spread(values: Sequence[T], count: int) -> list[T]:
     """Return at most `count` evenly spaced items."""
     places = np.linspace(0, len(values) - 1, min(count, len(values)))
     return [values[int(i)] for i in np.round(places)]
 
 
 def frame_shares(
-    model: Any,
-    variables: Mapping[str, Any],
+    model: DinoRade,
+    variables: VariableDict,
     data: Data,
     frames: FrameSequence,
 ) -> Iterator[tuple[LabelledFrame, Float[np.ndarray, "R A"]]]:
@@ -77,10 +83,12 @@ def frame_shares(
     assert images is not None  # the model has a camera
 
     @jax.jit
-    def share_of(variables: Any, projection: Any, image: Any, camera: Any) -> jax.Array:
-        inputs = jax.tree.map(lambda x: x[None], (projection, image, camera))
-        _, sown = model.apply(variables, *inputs, mutable=["intermediates"])
-        return sown["intermediates"]["image_fusion"]["camera_share"][0][0]
+    def share_of(variables: VariableDict, *inputs: PyTree[Array]) -> jax.Array:
+        batch = jax.tree.map(lambda x: x[None], inputs)
+        _, sown = model.apply(variables, *batch, mutable=["intermediates"])
+        share: jax.Array
+        share = sown["intermediates"]["image_fusion"]["camera_share"][0][0]
+        return share
 
     variables = jax.device_put(dict(variables))
     keys = sample_keys(data.records, frames, model.num_frames)
@@ -92,7 +100,7 @@ def frame_shares(
 
 def average_shares(
     shares: Iterable[tuple[str, Float[np.ndarray, "R A"]]], grid: RadarGrid
-) -> dict[str, dict[str, Any]]:
+) -> dict[str, JsonObject]:
     """Compute the mean weight of the camera by group over the bins in its view.
 
     Bins without a query that projects into the image have weight 0, which is not an output
@@ -109,7 +117,8 @@ def average_shares(
         bin in view, that is, with an image.
     """
     groups, maps = zip(*shares, strict=True)
-    names, stacked = np.array(groups), np.stack(maps)
+    names = np.array(groups)
+    stacked = np.stack(maps)
     means = {}
     for name in ("all", *dict.fromkeys(groups)):
         chosen = stacked if name == "all" else stacked[names == name]

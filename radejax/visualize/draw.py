@@ -175,7 +175,9 @@ def bin_edges(centers: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n+1"]:
     """Return the edges of bins; a single bin is drawn with a width of 1."""
     if centers.size == 1:
         return np.array([centers[0] - 0.5, centers[0] + 0.5])
-    return values_at(centers, np.arange(centers.size + 1) - 0.5)
+    edges: Float[np.ndarray, " n+1"]
+    edges = values_at(centers, np.arange(centers.size + 1) - 0.5)
+    return edges
 
 
 def to_polar(points: Float[np.ndarray, "*points 2"]) -> Float[np.ndarray, "*points 2"]:

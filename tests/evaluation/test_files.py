@@ -1,7 +1,5 @@
-import dataclasses
 import json
 import shutil
-import types
 
 import numpy as np
 import pytest
@@ -10,6 +8,7 @@ from click.testing import CliRunner
 from radejax.cli.main import main
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import Boxes
+from radejax.data.dataset import LabelledFrame
 from radejax.evaluation import boxes, files, kitti
 from radejax.evaluation.files import Source
 from radejax.evaluation.results import ReportOptions
@@ -74,18 +73,10 @@ def test_frame_keys():
 
 
 def test_tables_from_frames():
-    frame = types.SimpleNamespace(
-        sequence=3,
-        name="00001_00001",
-        weather="fog",
-        environment="urban",
-        time="day",
-        boxes=np.ones((2, 7)),
-        classes=["Sedan", "Bicycle"],
-        is_simulated=False,
-    )
-    other = {"boxes": np.zeros((0, 7)), "classes": [], "weather": "rain"}
-    empty = types.SimpleNamespace(**{**vars(frame), **other})
+    classes = np.array(["Sedan", "Bicycle"])
+    frame = LabelledFrame(3, "00001_00001", np.ones((2, 7)), classes, weather="fog")
+    none = np.zeros(0, str)
+    empty = LabelledFrame(3, "00002_00002", np.zeros((0, 7)), none, weather="rain")
     truth, table = boxes.tables_from_frames([empty, frame])
     assert truth.frame.tolist() == [1, 1]
     assert truth.cls.tolist() == ["Sedan", "Bicycle"]
@@ -165,7 +156,7 @@ def test_wrong_files_are_named(tmp_path, name, content, message):
 def test_wrong_sources_are_named(stored):
     folder, source = stored
     path, table = folder / "found.json", folder / "frames.json"
-    none = dataclasses.replace(source, sequences=(77,))
+    none = source.replace(sequences=(77,))
     text = table.read_text()
     shape = r"frames\.json is not .* column 'name' has shape \(1,\)"
     for given, frames, message in (
@@ -222,7 +213,7 @@ def test_ground_truth_of_a_report(stored):
     shutil.copy(folder / "truth.npz", report / "ground_truth.npz")
     shutil.copy(folder / "frames.json", report)
     for place in (report, report.parent):
-        other = dataclasses.replace(source, ground_truth=str(place))
+        other = source.replace(ground_truth=str(place))
         found = files.load(folder / "found.json", other, ("Sedan",))
         assert_same(found[0], expected[0])
         assert_same(found[1], expected[1])
@@ -232,7 +223,7 @@ def test_ground_truth_of_a_report(stored):
 def test_a_part_of_the_frames(stored):
     folder, source = stored
     _, _, whole, _ = files.load(folder / "found.json", source, ("Sedan",))
-    part = dataclasses.replace(source, weather=("fog", "rain"))
+    part = source.replace(weather=("fog", "rain"))
     truth, found, frames, _ = files.load(folder / "found.json", part, ("Sedan",))
     chosen = whole["frame"][np.isin(whole["weather"], ("fog", "rain"))]
     assert 0 < chosen.size < whole["frame"].size
