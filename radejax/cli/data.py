@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pathlib
 import time
-from typing import TYPE_CHECKING, Literal, Unpack
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -121,12 +121,7 @@ def data() -> None:
 @entry.camera_calibration
 @click.option("--deep", is_flag=True, help="Read every radar tensor completely.")
 @entry.json_option
-def check(
-    roots: tuple[str, ...],
-    deep: bool,
-    as_json: bool,
-    **part: Unpack[entry.LabelledPart],
-) -> None:
+def check(roots: tuple[str, ...], as_json: bool, **options: Any) -> None:
     """Report what is there, what is missing and what is corrupted.
 
     Exit code 1 if anything is missing or corrupted.
@@ -135,7 +130,7 @@ def check(
     """
     from radejax.data.kradar.check import check_dataset
 
-    report = check_dataset(roots, deep=deep, progress=not as_json, **part)
+    report = check_dataset(roots, progress=not as_json, **options)
     entry.echo_result(as_json, report.to_dict(), report.to_text())
     if report.num_problems:
         raise SystemExit(entry.FAILED)
@@ -172,7 +167,7 @@ def preprocess(
     dtype: str | None,
     num_workers: int | None,
     shard: tuple[int, int],
-    **part: Unpack[entry.LabelledPart],
+    **part: Any,
 ) -> None:
     """Project radar tensors to records of range-azimuth maps.
 
@@ -202,12 +197,7 @@ def preprocess(
     help="polar3d: mean power and Doppler of every cell. rpc: the strongest cells.",
 )
 @_rate
-def reduce(
-    roots: tuple[str, ...],
-    out: pathlib.Path,
-    release: Literal["polar3d", "rpc"],
-    rate: float,
-) -> None:
+def reduce(roots: tuple[str, ...], out: pathlib.Path, **options: Any) -> None:
     """Write the files of K-Radar's reduced releases from radar tensors.
 
     The other files of ROOTS become symbolic links. Run again, it writes only missing files.
@@ -217,7 +207,7 @@ def reduce(
     """
     from radejax.data.kradar.reduce import reduce_dataset
 
-    _echo_report(reduce_dataset(roots, out, release=release, rate=rate))
+    _echo_report(reduce_dataset(roots, out, **options))
 
 
 @click.command(cls=entry.Command)
@@ -249,11 +239,9 @@ def points(
     paths: tuple[str, ...],
     out: pathlib.Path,
     suffix: str,
-    method: Literal["percentile", "cfar"],
-    rate: float,
-    threshold_db: float,
     sequence_numbers: tuple[int, ...] | None,
     weather: tuple[str, ...] | None,
+    **options: Any,
 ) -> None:
     """Write radar points of radar tensors, projections, polar3d or rpc files.
 
@@ -289,14 +277,7 @@ def points(
     began = time.perf_counter()
     for target, path in tqdm.tqdm(sources.items(), "points", unit="frame"):
         try:
-            cloud = read_points(
-                path,
-                grid,
-                method=method,
-                rate=rate,
-                threshold_db=threshold_db,
-                is_axis_up=is_axis_up,
-            )
+            cloud = read_points(path, grid, is_axis_up=is_axis_up, **options)
         except (DataError, OSError) as error:
             skipped[str(path)] = str(error)
             continue
@@ -334,7 +315,7 @@ def embed(
     out: pathlib.Path,
     dtype: str | None,
     batch_size: int,
-    **part: Unpack[entry.Part],
+    **part: Any,
 ) -> None:
     """Precompute frozen-backbone features of the front camera images.
 

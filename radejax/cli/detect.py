@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 import pathlib
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -13,32 +12,6 @@ from radejax.cli import entry
 
 if TYPE_CHECKING:
     from radejax.inference.saved import Step
-
-
-def _loaded(command: entry.Function) -> entry.Function:
-    """Makes a command receive the detector that its options describe."""
-
-    @functools.wraps(command)
-    def loaded(
-        *,
-        source: str,
-        step: Step = None,
-        image_backbone: str | None,
-        score_threshold: float | None = None,
-        nms_iou: float | None = None,
-        **options: object,
-    ) -> None:
-        entry.set_up_jax()
-        detector = radejax.Detector.from_workdir(
-            source,
-            step,
-            image_backbone=image_backbone,
-            score_threshold=score_threshold,
-            nms_iou=nms_iou,
-        )
-        command(detector=detector, **options)
-
-    return loaded
 
 
 @click.command(cls=entry.Command)
@@ -76,15 +49,16 @@ def _loaded(command: entry.Function) -> entry.Function:
 @entry.batch_size(8, "Frames per call of the detector.")
 @entry.image_backbone
 @entry.json_option
-@_loaded
 def detect(
     roots: tuple[str, ...],
-    detector: radejax.Detector,
+    source: str,
     out: pathlib.Path,
+    step: Step,
+    image_backbone: str | None,
     batch_size: int,
     file_format: str,
     as_json: bool,
-    **part: Unpack[entry.Part],
+    **options: Any,
 ) -> None:
     """Find boxes in every frame below the folders.
 
@@ -98,7 +72,12 @@ def detect(
     """
     from radejax.inference.detect_files import detect_files, find_inputs
 
-    inputs = find_inputs(detector, roots, **part)
+    entry.set_up_jax()
+    thresholds = {n: options.pop(n) for n in ("score_threshold", "nms_iou")}
+    detector = radejax.Detector.from_workdir(
+        source, step, image_backbone=image_backbone, **thresholds
+    )
+    inputs = find_inputs(detector, roots, **options)
     count = detect_files(
         detector, inputs, out, batch_size=batch_size, file_format=file_format
     )
@@ -150,16 +129,8 @@ def detect(
 @click.option(
     "--half", is_flag=True, help="Store weights as float16 (huggingface only)."
 )
-@_loaded
 def export(
-    detector: radejax.Detector,
-    out: pathlib.Path,
-    kind: str,
-    platforms: tuple[str, ...],
-    with_backbone: bool,
-    batch_size: int | None,
-    radar_input: str,
-    half: bool,
+    source: str, out: pathlib.Path, image_backbone: str | None, **settings: Any
 ) -> None:
     """Export a model as a folder for other programs.
 
@@ -172,16 +143,9 @@ def export(
     """
     from radejax.inference import export as exporting
 
-    done = exporting.export(
-        detector,
-        out,
-        kind=kind,
-        platforms=platforms,
-        with_backbone=with_backbone,
-        batch_size=batch_size,
-        half=half,
-        radar_input=radar_input,
-    )
+    entry.set_up_jax()
+    detector = radejax.Detector.from_workdir(source, image_backbone=image_backbone)
+    done = exporting.export(detector, out, **settings)
     text = f"{done['bytes'] / 2**20:.1f} MiB written to {out}"
     if done["left_out"]:
         text += f", without {', '.join(done['left_out'])}"

@@ -16,14 +16,13 @@ import re
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from typing import Any, NotRequired, TypedDict, TypeVar
+from typing import Any
 
 import click
 
 from radejax.core.compilation_cache import enable_compilation_cache
 from radejax.core.files import is_no_space
 
-T = TypeVar("T")
 Function = Callable[..., object]
 Decorator = Callable[[Function], Function]
 """Adds one or more options to the function of a command."""
@@ -202,21 +201,17 @@ def _step(text: str) -> int | str:
 
 def several(
     *names: str,
-    help: str,
     kind: Callable[[str], object] = str,
     metavar: str = "A,B,...",
-    required: bool = False,
-    default: tuple[str, ...] = (),
+    **settings: Any,
 ) -> Decorator:
     """Returns an option for several values: `--data A,B --data C` gives A, B and C.
 
     Args:
         *names: Names of the option, as for `click.option`.
-        help: Help of the option.
         kind: Function that converts the text of each value.
         metavar: Example of the values, shown in the help.
-        required: Whether the option must be given.
-        default: Values of the option if it is not given.
+        **settings: Other arguments of `click.option`.
     """
 
     def split(
@@ -232,13 +227,7 @@ def several(
         return found or None
 
     return click.option(
-        *names,
-        multiple=True,
-        callback=split,
-        metavar=metavar,
-        help=help,
-        required=required,
-        default=default,
+        *names, multiple=True, callback=split, metavar=metavar, **settings
     )
 
 
@@ -296,21 +285,6 @@ weather = several(
     help="Use sequences with this weather only. Default: all.",
 )
 part = together(labels, sequences, weather)
-
-
-class Part(TypedDict):
-    """Values of `part` and, if a command has it, of `camera_calibration`."""
-
-    labels: str | None
-    sequence_numbers: tuple[int, ...] | None
-    weather: tuple[str, ...] | None
-    camera_calibration: NotRequired[str | None]
-
-
-class LabelledPart(Part):
-    """Values of `labelled_frames` and, if a command has it, of `camera_calibration`."""
-
-    version: str
 
 
 labelled_frames = together(

@@ -178,11 +178,7 @@ def evaluate(
 @_SETTINGS
 @entry.json_option
 def score(
-    predictions: str,
-    out: str | None,
-    name: str | None,
-    as_json: bool,
-    **options: object,
+    predictions: str, out: str | None, name: str | None, as_json: bool, **options: Any
 ) -> None:
     """Evaluate predictions in files.
 

@@ -6,7 +6,7 @@ import dataclasses
 import pathlib
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
-from typing import TYPE_CHECKING, Unpack
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -54,7 +54,7 @@ def overlay(
     lidar: bool,
     roi: str,
     max_frames: int | None,
-    **part: Unpack[entry.LabelledPart],
+    **part: Any,
 ) -> None:
     """Draw one frame's labels on radar and camera: the first look at new data.
 
@@ -147,7 +147,7 @@ def view(
     out: pathlib.Path,
     workdir: str | None,
     max_frames: int | None,
-    **part: Unpack[entry.LabelledPart],
+    **part: Any,
 ) -> None:
     """Record frames, by default all, for the rerun viewer (extra "viewer").
 

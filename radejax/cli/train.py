@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import functools
 import logging
 from collections.abc import Mapping
+from typing import Any
 
 import click
 
@@ -32,52 +32,6 @@ class _Command(entry.Command):
         rest = super().parse_args(ctx, words)
         ctx.params["fields"] = values
         return rest
-
-
-_processes = entry.together(
-    click.option(
-        "--distributed",
-        is_flag=True,
-        help="One of several processes, as Slurm starts them.",
-    ),
-    click.option(
-        "--coordinator",
-        help="host:port of process 0. Default: detected under Slurm, Open MPI and on TPU "
-        "pods.",
-    ),
-    click.option(
-        "--num-processes", type=entry.COUNT, help="Total number of processes."
-    ),
-    click.option(
-        "--process-id", type=click.IntRange(0), help="Rank of this process, from 0."
-    ),
-)
-
-
-def _joined(command: entry.Function) -> entry.Function:
-    """Makes a command join the other processes of a run before it begins."""
-
-    @_processes
-    @functools.wraps(command)
-    def joined(
-        *,
-        distributed: bool,
-        coordinator: str | None,
-        num_processes: int | None,
-        process_id: int | None,
-        **options: object,
-    ) -> None:
-        from radejax.core.devices import end_with_others
-
-        entry.set_up_jax()
-        place = coordinator, num_processes, process_id
-        with contextlib.ExitStack() as processes:
-            if distributed or place != (None,) * 3:
-                join_processes(*place)
-                processes.enter_context(end_with_others())
-            command(**options)
-
-    return joined
 
 
 @click.command(cls=_Command)
@@ -109,7 +63,19 @@ def _joined(command: entry.Function) -> entry.Function:
     help="Train once per seed, in seed0, seed1, ..., instead of with config.seed.",
 )
 @click.option("--profile", help="Folder for a trace of a few training steps.")
-@_joined
+@click.option(
+    "--distributed",
+    is_flag=True,
+    help="One of several processes, as Slurm starts them.",
+)
+@click.option(
+    "--coordinator",
+    help="host:port of process 0. Default: detected under Slurm, Open MPI and on TPU pods.",
+)
+@click.option("--num-processes", type=entry.COUNT, help="Total number of processes.")
+@click.option(
+    "--process-id", type=click.IntRange(0), help="Rank of this process, from 0."
+)
 def train(
     *,
     config: str,
@@ -118,7 +84,8 @@ def train(
     init_from: str | None,
     seeds: tuple[int, ...] | None,
     profile: str | None,
-    **data: object,
+    distributed: bool,
+    **data: Any,
 ) -> None:
     """Train a detector, then evaluate it.
 
@@ -131,16 +98,24 @@ def train(
     Example: radejax train --config radenet:official --data /disk1/kradar,/disk2/kradar
     """
     from radejax.config import config_name, load_config, with_texts
+    from radejax.core.devices import end_with_others
     from radejax.runs.experiment import run, run_seeds
 
+    entry.set_up_jax()
+    place = [data.pop(n) for n in ("coordinator", "num_processes", "process_id")]
     workdir = workdir or f"runs/{config_name(config)}"
-    settings = with_texts(load_config(config), fields)
-    data["sequences"] = data.pop("sequence_numbers")
-    settings = settings.replace(data={name: x for name, x in data.items() if x})
-    if seeds:
-        run_seeds(settings, workdir, seeds, init_from=init_from, profile=profile)
-    else:
-        run(settings, workdir, init_from=init_from, profile=profile)
+    with contextlib.ExitStack() as processes:
+        if distributed or place != [None] * 3:
+            join_processes(*place)
+            processes.enter_context(end_with_others())
+        # Parts that a config names are imported, and may use JAX.
+        settings = with_texts(load_config(config), fields)
+        data["sequences"] = data.pop("sequence_numbers")
+        settings = settings.replace(data={name: x for name, x in data.items() if x})
+        if seeds:
+            run_seeds(settings, workdir, seeds, init_from=init_from, profile=profile)
+        else:
+            run(settings, workdir, init_from=init_from, profile=profile)
 
 
 def join_processes(

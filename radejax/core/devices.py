@@ -87,10 +87,7 @@ def put_batch(
 
 
 def state_sharding(
-    state: PyTree[jax.Array | jax.ShapeDtypeStruct],
-    mesh: Mesh,
-    parameters: ParameterSharding,
-    min_size: int = 2**16,
+    state: PyTree, mesh: Mesh, parameters: ParameterSharding, min_size: int = 2**16
 ) -> PyTree[NamedSharding]:
     """Returns a pytree of `NamedSharding` with the placement of each array of a train state.
 

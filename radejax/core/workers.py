@@ -15,29 +15,18 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import resource_tracker
-from typing import ParamSpec, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from radejax.core.errors import UserError
 
-Arguments = ParamSpec("Arguments")
-Result = TypeVar("Result")
+T = TypeVar("T")
+Submit = Callable[..., concurrent.futures.Future[Any]]
 
 # At K-Radar's size, 446 MB were measured for reading a compressed radar tensor and 320 MB
 # for simulating with images, libraries included.
 _WORKER_BYTES = 450e6
 _CONTROL_GROUPS = pathlib.Path("/sys/fs/cgroup")
 _PROC = pathlib.Path("/proc")
-
-
-class Submit(Protocol):
-    """Function that starts a call in a worker process and returns the future result."""
-
-    def __call__(
-        self,
-        function: Callable[Arguments, Result],
-        *args: Arguments.args,
-        **kwargs: Arguments.kwargs,
-    ) -> concurrent.futures.Future[Result]: ...
 
 
 def usable_cpus() -> int:
@@ -141,10 +130,9 @@ def process_pool(
 
 def _submit(
     pool: concurrent.futures.ProcessPoolExecutor,
-    function: Callable[Arguments, Result],
-    *args: Arguments.args,
-    **kwargs: Arguments.kwargs,
-) -> concurrent.futures.Future[Result]:
+    function: Callable[..., T],
+    *arguments: object,
+) -> concurrent.futures.Future[T]:
     """Submits work while SIGINT is blocked.
 
     A process that the pool starts for it inherits this signal mask. A mask that the process
@@ -153,7 +141,7 @@ def _submit(
     resource_tracker.ensure_running()  # starting it later would clear the mask
     old = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        return pool.submit(function, *args, **kwargs)
+        return pool.submit(function, *arguments)
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, old)
 

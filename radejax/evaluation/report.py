@@ -25,7 +25,7 @@ import json
 import pathlib
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple, TypedDict
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool
@@ -106,7 +106,7 @@ def write_report(
     }
     # The split is that of all frames, or None if it is unknown or differs.
     splits = np.unique(np.asarray(frames.get("split", [])).astype(str))
-    found = {
+    metrics: JsonObject = {
         "run": run,
         "options": options.to_dict(),
         "split": splits.item() if splits.size == 1 else None,
@@ -124,7 +124,7 @@ def write_report(
         "box_errors": analysis.box_errors(data, iou),
         "worst_frames": analysis.worst_frames(data, frames, iou),
     }
-    metrics = plain(found)
+    metrics = plain(metrics)
     by_key = {result.key: result for result in results}
     tables = RunTables(run, by_key, options, metrics["split"])
     text = _console_text(metrics, tables)
@@ -296,13 +296,10 @@ def rendered(
     return "\n".join(table.render(style, is_simulated=is_simulated) for table in tables)
 
 
-def write_tables(
-    path: pathlib.Path, tables: Sequence[Table], *, is_simulated: bool
-) -> None:
+def write_tables(path: pathlib.Path, tables: Sequence[Table], **options: bool) -> None:
     """Writes tables as Markdown and LaTeX to files with these suffixes, see `rendered`."""
     for suffix, style in ((".md", "markdown"), (".tex", "latex")):
-        text = rendered(tables, style, is_simulated=is_simulated)
-        files.write_text(path.with_suffix(suffix), text)
+        files.write_text(path.with_suffix(suffix), rendered(tables, style, **options))
 
 
 def number(value: float | None, *, signed: bool = False, digits: int = 2) -> str:
@@ -456,14 +453,8 @@ PUBLISHED = _read()
 
 # Tables of a run ----------------------------------------------------------------------
 
-
-class Place(TypedDict, total=False):
-    """Fields of a `Cell` by name."""
-
-    condition: str
-    cls: str
-    space: str
-    iou: float
+Place = Mapping[str, Any]
+"""Fields of a `Cell` by name."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -528,9 +519,8 @@ class RunTables:
         if 0.3 not in self.options.iou_thresholds:
             return []
         spaces: list[Place] = [{"space": space} for space in SPACES]
-        conditions: list[Place] = [{"condition": name} for name in CONDITIONS]
-        names = (*self.options.classes, "mean")
-        classes: list[Place] = [{"cls": name} for name in names]
+        conditions = [{"condition": name} for name in CONDITIONS]
+        classes = [{"cls": cls} for cls in (*self.options.classes, "mean")]
         of_others = ("Sedan", "Bus or Truck", "mean")  # classes of most other methods
         common = [place for place in classes if place["cls"] in of_others]
         ious = _crossed([{"iou": 0.3}, {"iou": 0.5}], spaces)
@@ -588,7 +578,7 @@ class RunTables:
         body: list[list[str]] = []
         for group in groups:
             of = _name(group)
-            cells = [Cell(**(group | column)) for column in columns]
+            cells = [Cell(**group, **column) for column in columns]
             printed = []
             for row in PUBLISHED:
                 values = [row.values.get(cell, "-") for cell in cells]
@@ -627,11 +617,10 @@ class RunTables:
 
 
 def _crossed(outer: Sequence[Place], inner: Sequence[Place]) -> list[Place]:
-    return [one | other for one in outer for other in inner]
+    return [{**one, **other} for one in outer for other in inner]
 
 
 def _name(place: Place) -> str:
     """Returns the title of a group or a column, such as "Light Snow BEV"."""
-    names: dict[object, str]
     names = {"3d": "3D", "bev": "BEV", 0.3: "IoU 0.3", 0.5: "IoU 0.5"} | TITLES
     return " ".join(str(names.get(value, value)) for value in place.values())

@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Annotated, Literal, TypedDict
+from typing import Annotated, Any, Literal, TypedDict
 
 import numpy as np
 import pydantic
@@ -299,26 +299,17 @@ def resample(
     protocol: str,
     space: str,
     iou: float,
-    *,
-    score_threshold: float = 0.0,
-    empty_frames: str = "protocol",
+    **settings: Any,
 ) -> Float[np.ndarray, "B _"]:
     """Computes `[B, C + 1]` APs of every class and their mean in every resample.
 
     The AP is NaN if a resample has no object of the class. The mean is over the classes
-    that occur. The other arguments are those of `EvaluationSet.results`.
+    that occur. `settings` are further arguments of `EvaluationSet.results`.
     """
+    settings |= {"iou_thresholds": iou, "spaces": space}
     samples = []
     for weight in weights:
-        results = data.results(
-            protocol,
-            iou_thresholds=iou,
-            empty_frames=empty_frames,
-            score_threshold=score_threshold,
-            spaces=space,
-            weights=weight,
-            curves=False,
-        )
+        results = data.results(protocol, weights=weight, curves=False, **settings)
         samples.append([*(result.ap_or_none for result in results), mean_ap(results)])
     return np.array(samples, np.float64)  # None becomes NaN
 

@@ -38,6 +38,8 @@ from radejax.simulation.dataset import simulate_dataset
 from radejax.training.options import TrainOptions
 from radejax.training.step import make_schedule
 
+Frames = LabelledFrames[LabelledFrame]
+
 _log = logging.getLogger(__name__)
 
 _INPUT_FRAMES = 20
@@ -74,7 +76,7 @@ class Data:
         self.camera: CameraOptions | None = None
         self.features: Records | None = None
         self._skipped = set[str]()
-        self._splits: dict[str, LabelledFrames[LabelledFrame]] = {}
+        self._splits: dict[str, Frames] = {}
         image = None
         if isinstance(config.model, DinoRadeOptions):
             self.camera = options.used_camera
@@ -118,9 +120,7 @@ class Data:
         """Projections of the frames, on their grid."""
         return records.open_projections(self._records_folder, self.frames.grid)
 
-    def split(
-        self, name: str, *, may_be_empty: bool = False
-    ) -> LabelledFrames[LabelledFrame]:
+    def split(self, name: str, *, may_be_empty: bool = False) -> Frames:
         """Return the frames of a split.
 
         Frames that `preprocess` skipped are left out and counted. The sequences that
@@ -150,13 +150,11 @@ class Data:
             raise UserError(f"no frames of the {name} split in {roots}")
         return self._splits[name]
 
-    def _chosen(
-        self, frames: LabelledFrames[LabelledFrame]
-    ) -> LabelledFrames[LabelledFrame]:
+    def _chosen(self, frames: Frames) -> Frames:
         """Return the frames of the chosen sequences and weathers."""
         return frames.part(self.options.sequences, self.options.weather)
 
-    def _part_of_train(self, name: str) -> LabelledFrames[LabelledFrame]:
+    def _part_of_train(self, name: str) -> Frames:
         """Return the part of the train split that is trained on, or is held out.
 
         Args:

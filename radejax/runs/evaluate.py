@@ -89,20 +89,12 @@ class Evaluation:
         least = self._options.min_score
         self._detector = Detector(saved, placement, score_threshold=least)
 
-    def predict(
-        self,
-        variables: VariableDict,
-        *,
-        progress: bool = True,
-        should_stop: Callable[[], bool] | None = None,
-    ) -> Boxes:
+    def predict(self, variables: VariableDict, **options: Any) -> Boxes:
         """Detect objects in all frames of the split.
 
         Args:
             variables: Variables of the model.
-            progress: Whether to show a progress bar.
-            should_stop: Function that is called before every batch; returning True ends
-                the evaluation.
+            **options: Keyword arguments of `predict_dataset`.
 
         Returns:
             Boxes whose score reaches `min_score`, see `predict_dataset`.
@@ -113,8 +105,7 @@ class Evaluation:
             self._seen,
             self._options.batch_size,
             images=self._images,
-            progress=progress,
-            should_stop=should_stop,
+            **options,
         )
 
     def validate(
@@ -217,10 +208,7 @@ class Evaluation:
                 save_figure(figure, folder / kind / f"{name}.{ending}")
         if usual:  # the layout of RADE-Net's Figure 4
             scenes = [
-                dataclasses.replace(
-                    self._scene(predictions, i),
-                    title=f"{name} ({frames[i].key}){suffix}",
-                )
+                self._scene(predictions, i, title=f"{name} ({frames[i].key}){suffix}")
                 for name, i in figures.fullest_of_weathers(frames).items()
             ]
             save_figure(draw_scenes(scenes), folder / f"scenes.{ending}")
@@ -230,7 +218,7 @@ class Evaluation:
                 figure = curves.draw_training(series, losses, workdir.name + suffix)
                 save_figure(figure, folder / f"training.{ending}")
 
-    def _scene(self, predictions: Boxes, index: int) -> Scene:
+    def _scene(self, predictions: Boxes, index: int, **fields: Any) -> Scene:
         """Return the scene of a frame with its boxes and image.
 
         Predictions are drawn if their score reaches `config.decode.score_threshold`, the
@@ -248,6 +236,7 @@ class Evaluation:
             predictions=predictions.take(is_drawn),
             roi=roi_bounds(self._options.roi),
             score_threshold=threshold,
+            **fields,
         )
 
     def _spread(self, count: int) -> list[int]:
@@ -344,6 +333,7 @@ def evaluate_run(
     if not saved.run:
         raise UserError(f"{workdir} is not a run: give a workdir of train.py")
     usual = report_options(saved.config)
+    # A wrong change fails before labels are read, which takes long.
     options = report_options(saved.config, **changes)
     config, data = data_of_run(saved, other)
     name = "evaluation" if other is None else f"evaluation_{data_name(other)}"

@@ -24,6 +24,7 @@ import pathlib
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import flax.linen as nn
 import grain
@@ -405,10 +406,7 @@ def run_info(workdir: pathlib.Path, init_from: PathLike | None = None) -> JsonOb
 
 
 def checkpoint_info(
-    config: Config,
-    grid: RadarGrid,
-    run: JsonObject,
-    same: JsonObject,
+    config: Config, grid: RadarGrid, run: JsonObject, same: JsonObject
 ) -> JsonObject:
     """Returns the plain values in every checkpoint of a run, which `inference.saved` reads.
 
@@ -442,12 +440,7 @@ _KEYS = ("name", "protocol", "score_threshold", "condition", "cls", "space", "io
 
 
 def run_seeds(
-    config: Config,
-    workdir: PathLike,
-    seeds: Sequence[int],
-    *,
-    init_from: PathLike | None = None,
-    profile: PathLike | None = None,
+    config: Config, workdir: PathLike, seeds: Sequence[int], **options: Any
 ) -> pathlib.Path:
     """Runs a config with several seeds, one after the other.
 
@@ -460,8 +453,7 @@ def run_seeds(
         config: Config of the runs.
         workdir: Folder of the runs `seed0`, `seed1`, ... and the summary.
         seeds: Seeds, all different.
-        init_from: See `run`.
-        profile: See `run`.
+        **options: Further arguments of `run`.
 
     Returns:
         The absolute path of the workdir. Its files `seeds.json`, `seeds.txt`,
@@ -476,12 +468,7 @@ def run_seeds(
     tables = {}
     for seed in seeds:
         _log.info("seed %d of %s", seed, list(seeds))
-        folder = run(
-            config.replace(seed=seed),
-            workdir / f"seed{seed}",
-            init_from=init_from,
-            profile=profile,
-        )
+        folder = run(config.replace(seed=seed), workdir / f"seed{seed}", **options)
         metrics = folder / "evaluation" / "metrics.csv"
         if not metrics.exists():
             _log.info("seed %d is not evaluated: it is not finished, or no data", seed)

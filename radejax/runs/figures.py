@@ -86,8 +86,7 @@ def frame_shares(
     def share_of(variables: VariableDict, *inputs: PyTree[Array]) -> jax.Array:
         batch = jax.tree.map(lambda x: x[None], inputs)
         _, sown = model.apply(variables, *batch, mutable=["intermediates"])
-        share: jax.Array
-        share = sown["intermediates"]["image_fusion"]["camera_share"][0][0]
+        share: jax.Array = sown["intermediates"]["image_fusion"]["camera_share"][0][0]
         return share
 
     variables = jax.device_put(dict(variables))

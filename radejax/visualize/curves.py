@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -49,17 +50,7 @@ def _draw_panel(ax: Axes, curves: Mapping[str, Curve]) -> None:
         if curve is not None:
             recall, precision = (np.asarray(values, float) for values in curve)
             order = np.argsort(recall, kind="stable")
-            ax.plot(
-                recall[order],
-                precision[order],
-                label=label,
-                # The first 24 lines all differ.
-                color=SERIES_COLORS[i % len(SERIES_COLORS)],
-                linestyle=_LINE_STYLES[
-                    (i + i // len(SERIES_COLORS)) % len(_LINE_STYLES)
-                ],
-                linewidth=1.8,
-            )
+            ax.plot(recall[order], precision[order], label=label, **_line(i))
             is_empty = is_empty and not recall.any()
     limits = (0, 1.02)
     ax.set(xlim=limits, ylim=limits, xlabel="recall", ylabel="precision")
@@ -142,3 +133,12 @@ def moving_mean(values: Float[np.ndarray, " N"], width: int) -> Float[np.ndarray
     means = np.full(values.shape, np.nan)
     np.divide(total, count, out=means, where=count > 0)
     return means
+
+
+def _line(i: int) -> dict[str, Any]:
+    """Return color and dash pattern of the i-th line; the first 24 lines all differ."""
+    return {
+        "color": SERIES_COLORS[i % len(SERIES_COLORS)],
+        "linestyle": _LINE_STYLES[(i + i // len(SERIES_COLORS)) % len(_LINE_STYLES)],
+        "linewidth": 1.8,
+    }

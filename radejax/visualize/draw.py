@@ -14,7 +14,7 @@ as such.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -143,26 +143,15 @@ def draw_bev(scene: Scene, *, color_limits: tuple[float, float] | None = None) -
         The axes; `.figure` is the figure.
     """
     ax = _draw_ground(scene, color_limits=color_limits, label=POWER_LABEL)
-    _add_legend(ax, scene, "lower center", (0.5, 1.0), 4)
+    _add_legend(ax, scene, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4)
     ax.set_title(scene.title, pad=24)
     return ax
 
 
-def _draw_ground(
-    scene: Scene,
-    ax: Axes | None = None,
-    color_limits: tuple[float, float] | None = None,
-    label: str = "",
-) -> Axes:
-    """Draw map, region, boxes and sensor; see `draw_map` for the other arguments."""
-    ax = draw_map(
-        scene.power,
-        scene.grid,
-        ax=ax,
-        extent=_extent_m(scene.grid, scene.roi),
-        color_limits=color_limits,
-        label=label,
-    )
+def _draw_ground(scene: Scene, **options: Any) -> Axes:
+    """Draw map, region, boxes and sensor; `options` are passed to `draw_map`."""
+    extent = _extent_m(scene.grid, scene.roi)
+    ax = draw_map(scene.power, scene.grid, extent=extent, **options)
     if scene.lidar_m is not None:
         style.draw_points(ax, scene.lidar_m[:, 1::-1])
     _draw_over(ax, scene, lambda points: points[..., ::-1])
@@ -175,16 +164,14 @@ def bin_edges(centers: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n+1"]:
     """Return the edges of bins; a single bin is drawn with a width of 1."""
     if centers.size == 1:
         return np.array([centers[0] - 0.5, centers[0] + 0.5])
-    edges: Float[np.ndarray, " n+1"]
-    edges = values_at(centers, np.arange(centers.size + 1) - 0.5)
+    edges: np.ndarray = values_at(centers, np.arange(centers.size + 1) - 0.5)
     return edges
 
 
 def to_polar(points: Float[np.ndarray, "*points 2"]) -> Float[np.ndarray, "*points 2"]:
     """Convert ground positions to azimuth in degrees, positive to the right, and range."""
-    polar: Float[np.ndarray, "*points 2"]
     x, y = points[..., 0], points[..., 1]
-    polar = np.stack([np.rad2deg(-np.arctan2(y, x)), np.hypot(x, y)], -1)
+    polar: np.ndarray = np.stack([np.rad2deg(-np.arctan2(y, x)), np.hypot(x, y)], -1)
     return polar
 
 
@@ -218,7 +205,7 @@ def draw_frame(scene: Scene) -> Figure:
     if has_image:
         _draw_view(figure.add_axes((0.53, 0.40, 0.45, 0.52)), scene)
     place = (0.765, 0.095 + height)
-    _add_legend(figure, scene, "lower center", place, 3)
+    _add_legend(figure, scene, loc="lower center", bbox_to_anchor=place, ncols=3)
     figure.suptitle(scene.title)
     return figure
 
@@ -266,10 +253,10 @@ def draw_scenes(scenes: Sequence[Scene]) -> Figure:
     _add_legend(
         figure,
         scenes[0],
-        "lower left",
-        (0.3 / width, (foot_in - _FOOT_IN + 0.2) / height),
-        3 if columns > 1 else 1,
         show_counts=False,
+        loc="lower left",
+        bbox_to_anchor=(0.3 / width, (foot_in - _FOOT_IN + 0.2) / height),
+        ncols=3 if columns > 1 else 1,
     )
     return figure
 
@@ -368,13 +355,7 @@ def _heading_marks(boxes: Float[np.ndarray, "N 7"]) -> Float[np.ndarray, "N 2 2"
 
 
 def _add_legend(
-    owner: Axes | Figure,
-    scene: Scene,
-    loc: Literal["lower center", "lower left"],
-    anchor: tuple[float, float],
-    ncols: int,
-    *,
-    show_counts: bool = True,
+    owner: Axes | Figure, scene: Scene, *, show_counts: bool = True, **place: Any
 ) -> None:
     """Add a legend with one handle per kind of line to axes or a figure."""
     handles = []
@@ -394,14 +375,7 @@ def _add_legend(
         line = Line2D([], [], color=style.ROI_COLOR, lw=1.4, ls="--", label=label)
         handles.append(line)
     # Counts, threshold and region fit in this font size.
-    owner.legend(
-        handles=handles,
-        fontsize=8,
-        frameon=False,
-        loc=loc,
-        bbox_to_anchor=anchor,
-        ncols=ncols,
-    )
+    owner.legend(handles=handles, fontsize=8, frameon=False, **place)
 
 
 # Slices -------------------------------------------------------------------------------

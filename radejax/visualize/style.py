@@ -11,7 +11,7 @@ import dataclasses
 import io
 import pathlib
 from collections.abc import Iterable, Sequence
-from typing import Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -37,17 +37,9 @@ COLOR_MAP = LinearSegmentedColormap.from_list(
 )
 ROI_COLOR = "black"
 LIDAR_COLOR = "#ffa64d"
-# The color-blind safe palette of Okabe and Ito, with a yellow that is visible on paper.
-SERIES_COLORS = (
-    "#0072B2",
-    "#D55E00",
-    "#009E73",
-    "#CC79A7",
-    "#E69F00",
-    "#56B4E9",
-    "#000000",
-    "#8A6D00",
-)
+# Color-blind safe palette, with a yellow that is visible on paper.
+_OKABE_ITO = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
+SERIES_COLORS = (*_OKABE_ITO, "#000000", "#8A6D00")
 
 
 class Style(NamedTuple):
@@ -131,8 +123,7 @@ class Scene:
     @property
     def power(self) -> Float[np.ndarray, "R A"]:
         """Maximum over all channels, which equals that over Doppler and elevation."""
-        power: Float[np.ndarray, "R A"]
-        power = np.asarray(self.projection, np.float32).max(-1)
+        power: np.ndarray = np.asarray(self.projection, np.float32).max(-1)
         return power
 
 
@@ -319,15 +310,9 @@ class _NotebookFigure(Figure):
         return buffer.getvalue()
 
 
-def new_figure(
-    width_in: float,
-    height_in: float,
-    *,
-    dpi: float = 110,
-    layout: Literal["constrained"] | None = None,
-) -> Figure:
+def new_figure(width_in: float, height_in: float, **options: Any) -> Figure:
     """Return an empty figure outside pyplot's list of open figures."""
-    return _NotebookFigure((width_in, height_in), dpi, layout=layout)
+    return _NotebookFigure(figsize=(width_in, height_in), **{"dpi": 110, **options})
 
 
 def color_limits_of(values: np.ndarray) -> tuple[float, float]:

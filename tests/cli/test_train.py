@@ -60,6 +60,6 @@ def test_fields_are_read_in_every_spelling() -> None:
     context = click.Context(train, **train.context_settings)
     words = ["--config=radenet", "--config.seed=1", "--config.seed=2", "--init-from=a"]
     train.parse_args(context, [*words, "--config.logging.wandb", "--weather=fog"])
-    fields = context.meta["fields"]
+    fields = context.params["fields"]
     assert fields == {"seed": "2", "logging.wandb": "true"}
     assert context.params["init_from"] == "a"

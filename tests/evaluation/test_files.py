@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import shutil
 
@@ -73,10 +74,15 @@ def test_frame_keys():
 
 
 def test_tables_from_frames():
-    classes = np.array(["Sedan", "Bicycle"])
-    frame = LabelledFrame(3, "00001_00001", np.ones((2, 7)), classes, weather="fog")
-    none = np.zeros(0, str)
-    empty = LabelledFrame(3, "00002_00002", np.zeros((0, 7)), none, weather="rain")
+    frame = LabelledFrame(
+        sequence=3,
+        name="00001_00001",
+        boxes=np.ones((2, 7)),
+        classes=np.array(["Sedan", "Bicycle"]),
+        weather="fog",
+    )
+    none = {"boxes": np.zeros((0, 7)), "classes": np.zeros(0, str)}
+    empty = dataclasses.replace(frame, **none, weather="rain")
     truth, table = boxes.tables_from_frames([empty, frame])
     assert truth.frame.tolist() == [1, 1]
     assert truth.cls.tolist() == ["Sedan", "Bicycle"]
