@@ -42,34 +42,27 @@ if TYPE_CHECKING:  # the names for editors and type checkers
     simulate = simulate_dataset
 
 # On first use: reading labels or evaluating files should not load the models.
-_LAZY = {
-    "Batch": "core.structures",
-    "Boxes": "core.structures",
-    "CLASSES": "core.structures",
-    "DataError": "core.errors",
-    "DetectionMaps": "core.structures",
-    "Detections": "core.structures",
-    "Detector": "inference.detector",
-    "KRadar": "data.kradar",
-    "RadarGrid": "geometry.radar_grid",
-    "SavedModel": "inference.saved",
-    "Scene": "visualize.style",
-    "UserError": "core.errors",
-    "data_of_run": "runs.data",
-    "draw_frame": "visualize.draw",
-    "enable_compilation_cache": "core.compilation_cache",
-    "evaluate": "evaluation",
-    "frame_scene": "runs.figures",
-    "front_view": "data.cameras",
-    "Config": "config",
-    "load_config": "config",
-    "load_model": "inference.saved",
-    "predict_dataset": "inference.predict",
-    "project_file": "data.kradar.tesseract",
-    "read_tesseract": "data.kradar.tesseract",
-    "run": "runs.experiment",
-    "simulate": "simulation.dataset:simulate_dataset",
+_MODULES = {
+    "config": ("Config", "load_config"),
+    "core.compilation_cache": ("enable_compilation_cache",),
+    "core.errors": ("DataError", "UserError"),
+    "core.structures": ("CLASSES", "Batch", "Boxes", "DetectionMaps", "Detections"),
+    "data.cameras": ("front_view",),
+    "data.kradar": ("KRadar",),
+    "data.kradar.tesseract": ("project_file", "read_tesseract"),
+    "evaluation": ("evaluate",),
+    "geometry.radar_grid": ("RadarGrid",),
+    "inference.detector": ("Detector",),
+    "inference.predict": ("predict_dataset",),
+    "inference.saved": ("SavedModel", "load_model"),
+    "runs.data": ("data_of_run",),
+    "runs.experiment": ("run",),
+    "runs.figures": ("frame_scene",),
+    "simulation.dataset:simulate_dataset": ("simulate",),
+    "visualize.draw": ("draw_frame",),
+    "visualize.style": ("Scene",),
 }
+_LAZY = {name: module for module, names in _MODULES.items() for name in names}
 
 __all__ = list(_LAZY)
 

@@ -103,16 +103,6 @@ _PREDICTIONS = together(
     ),
     group="Data",
 )
-_OTHER_DATA = (
-    "data",
-    "labels",
-    "label_version",
-    "sequences",
-    "weather",
-    "records",
-    "camera_calibration",
-    "embeddings",
-)
 
 
 @click.command(cls=entry.Command)
@@ -148,15 +138,17 @@ def evaluate(
 
     Example: radejax evaluate runs/quickstart
     """
+    from radejax.data.options import DataOptions
     from radejax.runs.evaluate import evaluate_run
 
     workdir = run_folder or workdir
     if workdir is None:
         raise UserError("give the workdir of a run: radejax evaluate RUN")
     given = _given(options)
-    other = {name: given.pop(name) for name in _OTHER_DATA if name in given}
-    if "data" in other:
-        other["roots"] = other.pop("data")
+    if "data" in given:
+        given["roots"] = given.pop("data")
+    names = (given.keys() & DataOptions.model_fields) - {"image_backbone"}
+    other = {name: given.pop(name) for name in names}
     entry.set_up_jax()
     report = evaluate_run(workdir, other=other or None, **given)
     assert report is not None  # because this is the only process

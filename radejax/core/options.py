@@ -95,14 +95,7 @@ class Options(pydantic.BaseModel):
         Examples:
             config.with_fields({"train.batch_size": 4, "loss.weights.focal": 8.0})
         """
-        changes: dict[str, object] = {}
-        for name, value in fields.items():
-            *sections, last = name.split(".")
-            change = {last: value}
-            for section in reversed(sections):
-                change = {section: change}
-            changes = _merged(changes, change)
-        return self.replace(**changes)
+        return type(self)(**_merged(self, fields))
 
     def fields(self) -> Iterator[tuple[str, object]]:
         """Yields dotted name and value of every field of all sections."""
@@ -122,10 +115,16 @@ class Options(pydantic.BaseModel):
 def _merged(
     section: Options | Mapping[str, object], changes: Mapping[str, object]
 ) -> dict[str, object]:
-    """Returns the changed fields of a section; a mapping changes fields of an inner one."""
+    """Returns the changed fields of a section.
+
+    A mapping, or a dotted name, changes fields of an inner section.
+    """
     values = dict(section)
-    for name, change in changes.items():
+    for path, change in changes.items():
+        name, _, rest = path.partition(".")
         inner = values.get(name)
+        if rest:
+            change = {rest: change}
         if isinstance(change, Mapping) and isinstance(inner, Options | Mapping):
             change = _merged(inner, change)
         values[name] = change

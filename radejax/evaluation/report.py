@@ -28,7 +28,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool
 from tabulate import LATEX_ESCAPE_RULES, tabulate
 
 from radejax.core import files
@@ -213,18 +212,12 @@ def _draw_curves(
     protocol = protocols.RECOMMENDED
     iou = options.iou_thresholds[0]
     suffix = ", simulated data" if data.is_simulated else ""
-    masks: dict[str, Bool[np.ndarray, " F"] | None] = {"all": None}
-    masks |= condition_masks(frames, "weather")
+    masks: dict[str, Any] = {"all": None, **condition_masks(frames, "weather")}
+    settings: dict[str, Any] = {"iou_thresholds": iou, **options.settings_of(protocol)}
     for space in SPACES:
         panels: dict[str, dict[str, Curve]] = {}
         for name, mask in masks.items():
-            results = data.results(
-                protocol,
-                iou_thresholds=iou,
-                spaces=space,
-                weights=mask,
-                **options.settings_of(protocol),
-            )
+            results = data.results(protocol, spaces=space, weights=mask, **settings)
             for result in results:
                 title = f"{result.cls}, {protocol}, {space}, IoU {iou:g}{suffix}"
                 curve = (result.recall, result.precision) if result.is_defined else None
@@ -238,9 +231,7 @@ def _draw_curves(
 
 def plain(values: JsonObject) -> JsonObject:
     """Converts values to strict JSON: NaN and infinity become null."""
-    strict: JsonObject = json.loads(
-        json.dumps(values), parse_constant=lambda name: None
-    )
+    strict: JsonObject = json.loads(json.dumps(values), parse_constant=lambda _: None)
     return strict
 
 
