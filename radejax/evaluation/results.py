@@ -21,7 +21,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from radejax.core.errors import UserError, require
 from radejax.core.files import JsonObject
 from radejax.core.options import AtLeastOne, BelowOne, Count, Fraction, Options
-from radejax.core.structures import CLASSES, MIN_SIZE_M, Boxes
+from radejax.core.structures import CLASSES, MIN_SIZE_M, NARROW_ROI, Boxes
 from radejax.data.kradar.conditions import WEATHERS
 from radejax.evaluation import protocols
 from radejax.evaluation.boxes import (
@@ -44,9 +44,8 @@ Thresholds = Annotated[tuple[BelowOne, ...], MinLen(1)]
 class EvaluationOptions(Options, section="config.evaluation"):
     """Options of every evaluation of a run."""
 
-    roi: Region = "narrow"
-    """Region of interest of ground truth and predictions: narrow, wide, or x0, x1, y0, y1,
-    z0, z1 in meters; None: everywhere."""
+    roi: Region = NARROW_ROI
+    """Region of interest: x0, x1, y0, y1, z0, z1 in meters; None: everywhere."""
     protocols: Names = ("coco101", "all_point", "kradar_r40")
     """Evaluation protocols, or module:Object; the first chooses the best checkpoint."""
     empty_frames: Literal["protocol", "class", "frame", "none"] = "protocol"
@@ -98,8 +97,9 @@ class Settings(TypedDict):
 class ReportOptions(EvaluationOptions):
     """Options of one report, which may be of boxes without a run.
 
-    The defaults are for boxes in files: all of them count, in every protocol. A run stores
-    and evaluates less, see `runs.evaluate.report_options`.
+    Five defaults differ from those of a run. Boxes in files have no score threshold of
+    their own, so that all of them count, in every protocol; and folders of results are named
+    after changes of options, in which the region has its name and not its bounds.
     """
 
     iou_thresholds: Thresholds = (0.3, 0.5, 0.7)
@@ -110,6 +110,8 @@ class ReportOptions(EvaluationOptions):
     """Score threshold of all protocols except all_point."""
     min_score: Fraction = 0.0
     """Predictions below this score are neither stored nor evaluated."""
+    roi: Region = "narrow"
+    """Region of interest of ground truth and predictions."""
     classes: tuple[str, ...] = CLASSES
     """Classes to evaluate."""
     label_version: str | None = None
