@@ -30,6 +30,7 @@ import flax.linen as nn
 import grain
 import jax
 import numpy as np
+from flax.typing import VariableDict
 from jax.sharding import Mesh, NamedSharding
 from jaxtyping import PyTree
 
@@ -54,7 +55,6 @@ from radejax.training.metric_writer import MetricWriter, Scores, log_results
 from radejax.training.step import (
     Metrics,
     TrainState,
-    Variables,
     count_steps,
     create_state,
     initial_variables,
@@ -191,7 +191,7 @@ def run(
 # Training ----------------------------------------------------------------------------
 
 
-Validate = Callable[[Variables, Callable[[], bool]], Scores]
+Validate = Callable[[VariableDict, Callable[[], bool]], Scores]
 """Function that evaluates variables during training. Its arguments are the variables, with
 averaged parameters if there are any, and a function that returns whether to stop, which every
 process must call equally often. If that returns True, it raises `devices.Stopped`."""
@@ -222,7 +222,7 @@ def fit(
     workdir: pathlib.Path,
     mesh: Mesh,
     *,
-    initial: Callable[[Batch], Variables] | None = None,
+    initial: Callable[[Batch], VariableDict] | None = None,
     validate: Validate | None = None,
     profile: PathLike | None = None,
 ) -> tuple[TrainState, bool]:
@@ -317,7 +317,7 @@ def _make_state_and_step(
     data: TrainingData,
     mesh: Mesh,
     checkpoints: Checkpoints,
-    initial: Callable[[Batch], Variables],
+    initial: Callable[[Batch], VariableDict],
 ) -> tuple[TrainState, loop.PlacedStep]:
     """Restores or initializes the state, and returns it with the function of a step."""
     train = config.train
@@ -325,7 +325,7 @@ def _make_state_and_step(
     is_frozen = getattr(model, "is_frozen", None)
     optimizer = make_optimizer(train, make_schedule(train, data.steps_per_epoch))
 
-    def create(variables: Variables) -> TrainState:
+    def create(variables: VariableDict) -> TrainState:
         return create_state(variables, optimizer, use_ema=use_ema, is_frozen=is_frozen)
 
     def place(state: TrainState) -> PyTree[NamedSharding]:

@@ -17,17 +17,24 @@ import pathlib
 import shutil
 import zlib
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
 from absl import logging as absl_logging
 from jax.experimental import multihost_utils
+from jax.typing import ArrayLike
+from jaxtyping import PyTree
 from orbax.checkpoint import checkpoint_managers as policies
 
 from radejax.core import devices, files
 from radejax.core.errors import DataError, one_line
+from radejax.core.files import JsonObject
+from radejax.core.structures import Batch
+
+if TYPE_CHECKING:  # inference reads checkpoints without the data pipeline
+    import grain
 
 _log = logging.getLogger(__name__)
 
@@ -122,10 +129,10 @@ class Checkpoints:
     def save(
         self,
         step: int,
-        state: Any,
-        data_iterator: Any,
+        state: PyTree,
+        data_iterator: grain.DatasetIterator[Batch],
         *,
-        info: Mapping[str, Any],
+        info: Mapping[str, object],
         best: float | None = None,
     ) -> None:
         """Starts to save a checkpoint, and returns as soon as the arrays are copied.
@@ -142,7 +149,7 @@ class Checkpoints:
         Raises:
             DiskFullError: No space is left on the disk; earlier checkpoints stay intact.
         """
-        description: dict[str, Any] = {
+        description: JsonObject = {
             "info": dict(info),
             "position": data_iterator.get_state(),
             "checksums": array_checksums(state),
@@ -165,8 +172,8 @@ class Checkpoints:
             self._manager.wait_until_finished()
 
     def restore(
-        self, state: Any, data_iterator: Any
-    ) -> tuple[Any, dict[str, Any], int] | None:
+        self, state: T, data_iterator: grain.DatasetIterator[Batch]
+    ) -> tuple[T, JsonObject, int] | None:
         """Restores the newest checkpoint that is intact.
 
         Newer, corrupted checkpoints are moved to a folder next to this one with a warning.
@@ -200,7 +207,9 @@ class Checkpoints:
             )
         return None
 
-    def restore_variables(self, step: int | None = None) -> tuple[Any, dict, int]:
+    def restore_variables(
+        self, step: int | None = None
+    ) -> tuple[dict[str, PyTree], JsonObject, int]:
         """Reads the variables of a model without the optimizer state.
 
         Args:
@@ -228,7 +237,7 @@ class Checkpoints:
         variables, description = found
         return {n: variables.get(n) for n in _VARIABLES}, description["info"], step
 
-    def _read_on_all(self, step: int, state: Any) -> tuple[Any, dict[str, Any]] | None:
+    def _read_on_all(self, step: int, state: T) -> tuple[T, JsonObject] | None:
         """Returns the result of `_read`; None if the checkpoint is corrupted in a process."""
         found = _on_all(lambda: self._read(step, state))
         if found is None or not _on_all(lambda: self._verify(step, found)):
@@ -236,7 +245,7 @@ class Checkpoints:
         return found
 
     @_without_orbax_log()
-    def _read(self, step: int, state: Any = None) -> tuple[Any, dict[str, Any]]:
+    def _read(self, step: int, state: PyTree = None) -> tuple[PyTree, JsonObject]:
         """Reads the state and the description of a checkpoint.
 
         It does not wait for other processes, as reading may fail on one of them only.
@@ -279,7 +288,7 @@ class Checkpoints:
             raise self._corrupted(step, one_line(error)) from error
         return found["state"], description
 
-    def _verify(self, step: int, found: tuple[Any, dict[str, Any]]) -> bool:
+    def _verify(self, step: int, found: tuple[PyTree, JsonObject]) -> bool:
         """Compares the checksums of the arrays that `_read` returned; returns True.
 
         All processes have to call this function.
@@ -300,7 +309,7 @@ class Checkpoints:
             f"{self.steps()}"
         )
 
-    def _saved_variables(self, step: int) -> dict[str, Any]:
+    def _saved_variables(self, step: int) -> dict[str, PyTree]:
         """Returns the metadata of the arrays in a checkpoint that are model variables."""
         with ocp.PyTreeCheckpointer() as reader:
             folder = self.folder / str(step) / "state"
@@ -347,7 +356,7 @@ def _on_all(work: Callable[[], T]) -> T | None:
 # Checksums ---------------------------------------------------------------------------
 
 
-def array_checksums(tree: Any) -> dict[str, int]:
+def array_checksums(tree: PyTree) -> dict[str, int]:
     """Computes the CRC-32 of the bytes of every array of a tree.
 
     The checksums do not depend on the placement of the arrays over devices and processes.
@@ -368,10 +377,10 @@ def array_checksums(tree: Any) -> dict[str, int]:
         return dict(zip(arrays, pool.map(_checksum, arrays.values()), strict=True))
 
 
-def _checksum(array: Any) -> int:
+def _checksum(array: ArrayLike) -> int:
     return zlib.crc32(np.asarray(array).reshape(-1).view(np.uint8).data)
 
 
-def _text_checksum(values: Any) -> str:
+def _text_checksum(values: JsonObject) -> str:
     """Computes the SHA-256 of plain values serialized as JSON."""
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()

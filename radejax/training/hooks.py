@@ -12,7 +12,6 @@ import dataclasses
 import logging
 import time
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
 
 import grain
 import jax
@@ -60,7 +59,7 @@ class ProgressBar(tqdm.tqdm):
         )
 
     def __call__(self, step: int, state: TrainState, metrics: Metrics) -> None:
-        self.update(step - self.n)
+        tqdm.tqdm.update(self, step - self.n)
 
 
 class Throughput:
@@ -131,7 +130,7 @@ class Log:
     steps_per_epoch: int
     throughput: Throughput
     writer: MetricWriter
-    bar: ProgressBar
+    bar: tqdm.tqdm
     has_warned: bool = False
 
     def __post_init__(self) -> None:
@@ -209,8 +208,8 @@ class Save:
     """
 
     checkpoints: Checkpoints
-    batches: grain.DatasetIterator[Any]
-    info: Mapping[str, Any]
+    batches: grain.DatasetIterator[Batch]
+    info: Mapping[str, object]
     check: Hook
     saved_step: int
 

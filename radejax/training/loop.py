@@ -5,21 +5,22 @@ from __future__ import annotations
 import collections
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
 
 import grain
 import jax
 import numpy as np
+from flax.typing import VariableDict
 from jax.extend.core import ClosedJaxpr
 from jax.interpreters import partial_eval
 from jax.sharding import Mesh
+from jaxtyping import PyTree
 
 from radejax.core import devices, files
 from radejax.core.errors import UserError
 from radejax.core.structures import Batch
 from radejax.training.checkpoints import Checkpoints
 from radejax.training.hooks import Hook
-from radejax.training.step import Metrics, Step, TrainState, Variables, run_keys
+from radejax.training.step import Metrics, Step, TrainState, run_keys
 
 _log = logging.getLogger(__name__)
 
@@ -77,7 +78,7 @@ def place_step(step: Step, state: TrainState, mesh: Mesh, seed: int) -> PlacedSt
     """
     whole = devices.replicated(mesh)
     placement = jax.tree.map(lambda x: x.sharding, state)
-    jitted = jax.jit(step, donate_argnums=0, out_shardings=(placement, whole))
+    jitted: Step = jax.jit(step, donate_argnums=0, out_shardings=(placement, whole))
     loop_key = jax.jit(lambda seed: run_keys(seed)[1], out_shardings=whole)
     rng = loop_key(np.uint32(seed))
 
@@ -98,10 +99,10 @@ def _is_debugging() -> bool:
 def restore_or_initialize(
     checkpoints: Checkpoints,
     batches: grain.DatasetIterator[Batch],
-    initial: Callable[[], Variables],
-    create: Callable[[Variables], TrainState],
-    place: Callable[[Any], Any],
-    same: Mapping[str, Any],
+    initial: Callable[[], VariableDict],
+    create: Callable[[VariableDict], TrainState],
+    place: Callable[[TrainState], PyTree],
+    same: Mapping[str, object],
 ) -> TrainState:
     """Restores the state of the newest checkpoint, or creates the state of step 0.
 
@@ -123,8 +124,10 @@ def restore_or_initialize(
     wanted = jax.tree.map(lambda x, s: x.update(sharding=s), abstract, placement)
     restored = checkpoints.restore(wanted.replace(frozen={}), batches)
     if restored is None:
-        state = jax.jit(create, out_shardings=placement)(_evaluate(traced, shapes))
-        return jax.device_put(state, placement)  # `jax_disable_jit` ignores `placement`
+        created = jax.jit(create, out_shardings=placement)(_evaluate(traced, shapes))
+        # `jax_disable_jit` ignores `out_shardings`.
+        state: TrainState = jax.device_put(created, placement)
+        return state
     state, info, step = restored
     saved = info.get("same", {})
     if lines := files.differences(saved, {k: same.get(k) for k in saved}, ""):
@@ -144,10 +147,11 @@ def empty_batch(batches: grain.DatasetIterator[Batch]) -> Batch:
     position = batches.get_state()
     batch = next(batches)
     batches.set_state(position)
-    return jax.tree.map(lambda x: np.zeros((1, *x.shape[1:]), x.dtype), batch)
+    empty: Batch = jax.tree.map(lambda x: np.zeros((1, *x.shape[1:]), x.dtype), batch)
+    return empty
 
 
-def _evaluate(traced: ClosedJaxpr, shapes: Variables) -> Variables:
+def _evaluate(traced: ClosedJaxpr, shapes: VariableDict) -> VariableDict:
     """Returns the results of a traced function as NumPy arrays.
 
     Only the operations that the results need are executed, one at a time. One program with
@@ -157,4 +161,6 @@ def _evaluate(traced: ClosedJaxpr, shapes: Variables) -> Variables:
     is_result = [True] * len(traced.jaxpr.outvars)
     needed, _ = partial_eval.dce_jaxpr(traced.jaxpr, is_result, instantiate=True)
     leaves = jax.core.eval_jaxpr(needed, traced.consts)
-    return jax.tree.unflatten(jax.tree.structure(shapes), map(np.asarray, leaves))
+    structure = jax.tree.structure(shapes)
+    variables: VariableDict = jax.tree.unflatten(structure, map(np.asarray, leaves))
+    return variables

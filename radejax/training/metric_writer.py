@@ -7,7 +7,7 @@ import hashlib
 import json
 import pathlib
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING
 
 import tensorboardX
 from matplotlib.figure import Figure
@@ -15,6 +15,9 @@ from matplotlib.figure import Figure
 from radejax.config import Config
 from radejax.core import devices, files
 from radejax.core.errors import DataError, UserError
+
+if TYPE_CHECKING:
+    import wandb
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +55,8 @@ class MetricWriter:
 
     def __init__(self, folder: pathlib.Path, config: Config, start_step: int) -> None:
         self._path = folder / "metrics.jsonl"
-        self._board, self._wandb = None, None
+        self._board: tensorboardX.SummaryWriter | None = None
+        self._wandb: wandb.Run | None = None
         if not devices.is_main():
             return
         if self._path.exists():
@@ -117,7 +121,7 @@ def _remove_after(step: int, path: pathlib.Path) -> None:
     files.write_text(path, "".join(kept))
 
 
-def _start_wandb(folder: pathlib.Path, config: Config) -> Any:
+def _start_wandb(folder: pathlib.Path, config: Config) -> wandb.Run:
     """Starts or resumes a workdir's run at Weights & Biases, which mirrors TensorBoard."""
     try:
         import wandb

@@ -64,7 +64,8 @@ class TrainOptions(Options, section="config.train"):
 
     @pydantic.model_validator(mode="after")
     def _check(self) -> TrainOptions:
-        final, peak = self.final_learning_rate, self.learning_rate
+        final = self.final_learning_rate
+        peak = self.learning_rate
         expected = f"at most config.train.learning_rate, {peak}"
         require(final <= peak, "config.train.final_learning_rate", final, expected)
         return self

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
 
 import chex
 import flax.linen as nn
-import flax.traverse_util
 import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
+from flax.traverse_util import flatten_dict, unflatten_dict
+from flax.typing import Collection, VariableDict
 from jax.typing import ArrayLike
-from jaxtyping import Float, Int, Num
+from jaxtyping import Float, Int, Num, PyTree
 
 from radejax.core.errors import UserError, require
 from radejax.core.structures import Batch
@@ -24,7 +24,6 @@ from radejax.losses.detection import LossOptions, detection_loss
 from radejax.training.options import TrainOptions
 
 Metrics = dict[str, Num[jax.Array, ""]]
-Variables = Mapping[str, Any]
 Step = Callable[["TrainState", Batch, jax.Array], tuple["TrainState", Metrics]]
 
 
@@ -55,7 +54,8 @@ def make_schedule(train: TrainOptions, steps_per_epoch: int) -> optax.Schedule:
     Raises:
         UserError: The warm-up is not shorter than the training.
     """
-    peak, minimum = train.learning_rate, train.final_learning_rate
+    peak = train.learning_rate
+    minimum = train.final_learning_rate
     warmup_steps = train.warmup_steps
     num_steps = count_steps(train, steps_per_epoch)
     expected = f"less than the {num_steps} steps of the training"
@@ -132,21 +132,21 @@ class TrainState(struct.PyTreeNode):
     step: Int[jax.Array, ""]
     num_skipped: Int[jax.Array, ""]
     num_skipped_in_row: Int[jax.Array, ""]
-    params: Any
-    model_state: Any
-    opt_state: Any
-    ema_params: Any
-    frozen: Any = dataclasses.field(default_factory=dict)
+    params: Collection
+    model_state: VariableDict
+    opt_state: optax.OptState
+    ema_params: PyTree
+    frozen: Collection = dataclasses.field(default_factory=dict)
 
     @property
-    def eval_variables(self) -> dict[str, Any]:
+    def eval_variables(self) -> VariableDict:
         """Variables for evaluation, with the averaged parameters if there are any."""
         params = self.params if self.ema_params is None else self.ema_params
         return {"params": merge_parameters(params, self.frozen), **self.model_state}
 
 
 def create_state(
-    variables: Mapping[str, Any],
+    variables: VariableDict,
     optimizer: optax.GradientTransformation,
     *,
     use_ema: bool,
@@ -175,32 +175,28 @@ def create_state(
 
 
 def split_parameters(
-    params: Mapping[str, Any], is_frozen: Callable[[str], bool] | None
-) -> tuple[dict[str, Any], dict[str, Any]]:
+    params: Collection, is_frozen: Callable[[str], bool] | None
+) -> tuple[Collection, Collection]:
     """Splits parameters into a tree of trained and a tree of frozen ones.
 
     Args:
         params: Parameters of the model.
         is_frozen: See `create_state`.
     """
-    flat = flax.traverse_util.flatten_dict(params, sep="/")
-    parts: tuple[dict, dict] = ({}, {})
-    for name, leaf in flat.items():
-        parts[is_frozen is not None and is_frozen(name)][name] = leaf
-    return tuple(flax.traverse_util.unflatten_dict(part, sep="/") for part in parts)
+    flat = flatten_dict(params, sep="/")
+    frozen = {n: x for n, x in flat.items() if is_frozen is not None and is_frozen(n)}
+    trained = {n: x for n, x in flat.items() if n not in frozen}
+    return unflatten_dict(trained, sep="/"), unflatten_dict(frozen, sep="/")
 
 
-def merge_parameters(
-    params: Mapping[str, Any], frozen: Mapping[str, Any]
-) -> dict[str, Any]:
+def merge_parameters(params: Collection, frozen: Collection) -> Collection:
     """Merges trained and frozen parameters; the inverse of `split_parameters`."""
-    trees = [flax.traverse_util.flatten_dict(t, sep="/") for t in (params, frozen)]
-    return flax.traverse_util.unflatten_dict({**trees[0], **trees[1]}, sep="/")
+    flat = {**flatten_dict(params, sep="/"), **flatten_dict(frozen, sep="/")}
+    merged: Collection = unflatten_dict(flat, sep="/")
+    return merged
 
 
-def with_pretrained(
-    variables: Mapping[str, Any], part: Mapping[str, Any]
-) -> dict[str, Any]:
+def with_pretrained(variables: VariableDict, part: VariableDict) -> VariableDict:
     """Returns variables with a part replaced, such as a pretrained image backbone.
 
     Args:
@@ -212,14 +208,15 @@ def with_pretrained(
     Raises:
         UserError: The shapes of a variable differ.
     """
-    merged = flax.traverse_util.flatten_dict(variables, sep="/")
-    for path, new in flax.traverse_util.flatten_dict(part, sep="/").items():
-        if path in merged and merged[path].shape != new.shape:
+    flat = flatten_dict(variables, sep="/")
+    for path, new in flatten_dict(part, sep="/").items():
+        if path in flat and flat[path].shape != new.shape:
             raise UserError(
-                f"pretrained {path} is {new.shape}, the model has {merged[path].shape}"
+                f"pretrained {path} is {new.shape}, the model has {flat[path].shape}"
             )
-        merged[path] = new
-    return flax.traverse_util.unflatten_dict(merged, sep="/")
+        flat[path] = new
+    merged: VariableDict = unflatten_dict(flat, sep="/")
+    return merged
 
 
 def run_keys(seed: int | jax.Array) -> jax.Array:
@@ -231,9 +228,9 @@ def initial_variables(
     model: nn.Module,
     seed: int,
     batch: Batch,
-    variables: Variables | None = None,
-    pretrained: Variables | None = None,
-) -> Variables:
+    variables: VariableDict | None = None,
+    pretrained: VariableDict | None = None,
+) -> VariableDict:
     """Creates the variables of step 0.
 
     Args:
@@ -280,8 +277,8 @@ def make_train_step(
     """
 
     def loss_fn(
-        params: Any, state: TrainState, batch: Batch, rng: jax.Array
-    ) -> tuple[Float[jax.Array, ""], tuple[Any, Metrics]]:
+        params: Collection, state: TrainState, batch: Batch, rng: jax.Array
+    ) -> tuple[Float[jax.Array, ""], tuple[VariableDict, Metrics]]:
         maps, model_state = model.apply(
             {"params": merge_parameters(params, state.frozen), **state.model_state},
             *batch.model_inputs(),
@@ -327,7 +324,7 @@ def make_train_step(
         )
         # If shapes or dtypes differed, the next step would be compiled again.
         chex.assert_trees_all_equal_shapes_and_dtypes(after, state)
-        counts = {"skipped": after.num_skipped}
-        return after, {"loss": total, **parts, "grad_norm": grad_norm, **counts}
+        metrics = {"loss": total, **parts, "grad_norm": grad_norm}
+        return after, {**metrics, "skipped": after.num_skipped}
 
     return step

@@ -22,23 +22,25 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import flax.traverse_util
 import jax
 import numpy as np
+from flax.traverse_util import flatten_dict, unflatten_dict
+from flax.typing import MutableVariableDict, VariableDict
 
 from radejax import models
 from radejax.core.archives import read_safetensors
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike, as_path
 from radejax.data.cameras import no_images
+from radejax.models.radenet import RadeNet
 from radejax.weights import torch_file
 
-Rules = Sequence[tuple[str, str | Callable[[re.Match], str]]]
+Rules = Sequence[tuple[str, str | Callable[[re.Match[str]], str]]]
 """Patterns and replacements of `re.sub`, applied in order to paths of Flax variables such as
 "backbone/start/kernel". A path that still contains a slash afterwards is of an unknown module."""
 
 StateDict = Mapping[str, Any]
-"""Tensors of torch by name."""
+"""NumPy, JAX or torch arrays by torch name."""
 
 Shapes = Mapping[str, tuple[int, ...]]
 """Shape of each variable by its path, "params/backbone/start/kernel"."""
@@ -57,16 +59,16 @@ _SHOWN = 20
 def from_torch(
     rules: Rules,
     shapes: Shapes,
-    tensors: Mapping[str, Any],
+    tensors: StateDict,
     source: PathLike,
     ignored: str = r"\Z",
-) -> dict[str, Any]:
+) -> MutableVariableDict:
     """Convert named tensors to the variables of a model.
 
     Args:
         rules: Rules of the model.
         shapes: Shapes of the variables.
-        tensors: NumPy, JAX or torch arrays by torch name.
+        tensors: Tensors by name.
         source: Name of the tensors in error messages.
         ignored: Pattern of the start of names that are ignored if they are not used. Unused
             `num_batches_tracked` are always ignored.
@@ -79,12 +81,13 @@ def from_torch(
             message lists up to 20 of them.
         UserError: A module matches no rule, because torch's code has no counterpart.
     """
-    left, problems = dict(tensors), []
+    left = dict(tensors)
+    problems = list[str]()
 
-    def take(name: str, path: str, shape: tuple[int, ...]) -> np.ndarray | None:
+    def take(name: str, path: str, shape: tuple[int, ...]) -> np.ndarray:
         if name not in left:
             problems.append(f"missing {name}")
-            return None
+            return np.broadcast_to(np.float32(0), shape)  # unused
         value = to_numpy(left.pop(name))
         ours = to_our_layout(path, value)
         if ours.ndim == 4 and len(shape) == 2:  # 1x1 convolution or patch embedding
@@ -94,17 +97,18 @@ def from_torch(
             problems.append(
                 f"{name} is {value.dtype}{value.shape}, expected {expected}"
             )
-            return None
+            return np.broadcast_to(np.float32(0), shape)  # unused
         if not np.isfinite(ours).all():
             problems.append(f"{name} has values that are not finite")
         return np.array(ours, np.float32, order="C")
 
-    flat: dict[str, Any] = {}
+    flat = {}
     for path, shape in shapes.items():
         name = torch_name(rules, path)
         if "{}" in name:
             layers = [take(name.format(i), path, shape[1:]) for i in range(shape[0])]
-            flat[path] = None if problems else np.stack(layers)  # type: ignore[arg-type]
+            if not problems:
+                flat[path] = np.stack(layers)
         else:
             flat[path] = take(name, path, shape)
     problems += [
@@ -115,14 +119,16 @@ def from_torch(
     if problems:
         shown = "; ".join(problem[:160] for problem in sorted(problems)[:_SHOWN])
         raise DataError(f"{source} does not fit, {len(problems)} problems: {shown}")
-    return flax.traverse_util.unflatten_dict(flat, sep="/")
+    variables: MutableVariableDict = unflatten_dict(flat, sep="/")
+    return variables
 
 
-def to_torch(rules: Rules, variables: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def to_torch(rules: Rules, variables: VariableDict) -> dict[str, np.ndarray]:
     """Invert `from_torch`; kernels stored as `[in, out]` become `[out, in]` in all cases."""
     tensors = {}
-    for path, leaf in flax.traverse_util.flatten_dict(variables, sep="/").items():
-        name, value = torch_name(rules, path), np.asarray(leaf, np.float32)
+    for path, leaf in flatten_dict(variables, sep="/").items():
+        name = torch_name(rules, path)
+        value = np.asarray(leaf, np.float32)
         stack = enumerate(value) if "{}" in name else [(0, value)]
         for i, part in stack:
             part = to_torch_layout(path, part)
@@ -166,35 +172,35 @@ def _torch_axes(path: str, ndim: int) -> tuple[int, ...]:
     return tuple(reversed(range(ndim)))
 
 
-def variable_shapes(model: Any) -> dict[str, tuple[int, ...]]:
+def variable_shapes(model: RadeNet) -> dict[str, tuple[int, ...]]:
     """Return the shapes of a detector's variables by path, without creating the variables."""
     options = model.options
-    bins, channels = options.pad_multiple, options.doppler_bins + options.elevation_bins
-    shape = (1, bins, bins, model.num_frames * channels)
-    inputs: list[Any] = [np.zeros(shape, np.float32)]
-    if models.has_camera(model):
-        inputs += no_images(1, options.image.size)
-    return shapes_of(jax.eval_shape(model.init, jax.random.key(0), *inputs))
+    bins = options.pad_multiple
+    channels = model.num_frames * (options.doppler_bins + options.elevation_bins)
+    radar = np.zeros((1, bins, bins, channels), np.float32)
+    camera = no_images(1, model.options.image.size) if models.has_camera(model) else ()
+    return shapes_of(jax.eval_shape(model.init, jax.random.key(0), radar, *camera))
 
 
-def check_finite(variables: Mapping[str, Any], source: PathLike) -> None:
+def check_finite(variables: VariableDict, source: PathLike) -> None:
     """Raise a `DataError` that names the first variable with NaN or infinite values."""
-    flat = flax.traverse_util.flatten_dict(dict(variables), sep="/")
-    for path, leaf in flat.items():
+    for path, leaf in flatten_dict(dict(variables), sep="/").items():
         if not np.isfinite(leaf).all():
             raise DataError(f"{source}: {path} has values that are not finite")
 
 
-def shapes_of(variables: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
+def shapes_of(variables: VariableDict) -> dict[str, tuple[int, ...]]:
     """Return the shapes of the leaves by path."""
-    flat = flax.traverse_util.flatten_dict(dict(variables), sep="/")
+    flat = flatten_dict(dict(variables), sep="/")
     return {path: tuple(leaf.shape) for path, leaf in flat.items()}
 
 
 # Files -------------------------------------------------------------------------------
 
 
-def read_state_dict(content_or_path: Any, *parts: str) -> tuple[dict[str, Any], str]:
+def read_state_dict(
+    content_or_path: PathLike | StateDict, *parts: str
+) -> tuple[StateDict, str]:
     """Read the state dict in a file or checkpoint and remove the prefix of its names.
 
     Args:
@@ -210,9 +216,11 @@ def read_state_dict(content_or_path: Any, *parts: str) -> tuple[dict[str, Any], 
         FileNotFoundError: There is no such file.
         DataError: The file is corrupted, or contains no such state dict or more than one.
     """
-    content, source = content_or_path, "state dict"
-    if isinstance(content, str | os.PathLike):
-        path, source = as_path(content), str(content)
+    content: object = content_or_path
+    source = "state dict"
+    if isinstance(content_or_path, str | os.PathLike):
+        path = as_path(content_or_path)
+        source = str(content_or_path)
         is_torch = path.suffix != ".safetensors"
         content = torch_file.read(path) if is_torch else read_safetensors(path)
     start = re.compile(rf"((?:.*\.)?)(?:{'|'.join(map(re.escape, parts))})")
@@ -233,9 +241,9 @@ def read_state_dict(content_or_path: Any, *parts: str) -> tuple[dict[str, Any], 
     return found[0], source
 
 
-def to_numpy(tensor: Any) -> np.ndarray:
+def to_numpy(tensor: object) -> np.ndarray:
     """Convert a NumPy, JAX or torch array to NumPy; torch's bfloat16 becomes float32."""
     if hasattr(tensor, "detach"):  # a torch tensor; checked without importing torch
-        tensor = tensor.detach().cpu()
-        return (tensor.float() if "bfloat16" in str(tensor.dtype) else tensor).numpy()
+        host = tensor.detach().cpu()
+        tensor = (host.float() if "bfloat16" in str(host.dtype) else host).numpy()
     return np.asarray(tensor)

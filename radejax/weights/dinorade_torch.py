@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
-from typing import Any
+
+from flax.typing import Collection, MutableVariableDict
 
 from radejax import models
 from radejax.core.errors import DataError, require
-from radejax.core.files import PathLike
+from radejax.core.files import JsonObject, PathLike
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.options import OFFICIAL_DINORADE, DinoRadeOptions, FusionOptions
 from radejax.weights import convert, dinov3_hf, radenet_torch
@@ -31,8 +31,8 @@ def read(
     tensors: StateDict,
     source: str,
     dinov3: PathLike | None = None,
-    **model_overrides: Any,
-) -> tuple[DinoRadeOptions, dict[str, Any]]:
+    **model_overrides: object,
+) -> tuple[DinoRadeOptions, MutableVariableDict]:
     """Return the options and the variables of tensors by official name.
 
     The geometry is the released one. The camera is `CameraCalibration.from_kradar(file,
@@ -86,7 +86,7 @@ def read(
 
 def _transformer(
     tensors: StateDict, source: str, dinov3: PathLike | None
-) -> tuple[dict[str, Any], Mapping[str, Any] | None]:
+) -> tuple[dict[str, object], Collection | None]:
     """Return fields and parameters of the transformer in the folder, else the checkpoint."""
     if dinov3 is not None:
         vit, variables = dinov3_hf.load(dinov3)
@@ -103,7 +103,7 @@ def _transformer(
     return dinov3_hf.image_fields(vit.options), params
 
 
-def infer_fusion(tensors: StateDict, overrides: Mapping[str, Any]) -> dict[str, Any]:
+def infer_fusion(tensors: StateDict, overrides: JsonObject) -> JsonObject:
     """Infer fields of `config.model.fusion` from names and shapes, and apply the overrides."""
     has_weights = any(n.startswith("fusion.weighting_network.") for n in tensors)
     has_necks = any(n.startswith("fusion.rad_neck.") for n in tensors)
@@ -155,7 +155,7 @@ def rules(heads: str, is_resnet: bool) -> Rules:
     return (*image, *_FUSION, *radenet_torch.rules(heads, "rad_"))
 
 
-def without_lora(tensors: StateDict) -> dict[str, Any]:
+def without_lora(tensors: StateDict) -> StateDict:
     """Merge low-rank adapters (PEFT) into the weights that they adapt: W + B A.
 
     The factor alpha / rank is 1, because both are 16 in the released settings. These settings

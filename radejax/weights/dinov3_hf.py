@@ -18,16 +18,15 @@ import contextlib
 import math
 import pathlib
 import re
-from collections.abc import Mapping
-from typing import Any
 
 import jax
 import numpy as np
 import safetensors.numpy
+from flax.typing import Collection, MutableCollection, MutableVariableDict
 
 from radejax.core import files
 from radejax.core.errors import DataError, UserError, require
-from radejax.core.files import PathLike
+from radejax.core.files import JsonObject, PathLike
 from radejax.models.options import ViTOptions
 from radejax.models.vit import ViT
 from radejax.weights import convert
@@ -51,7 +50,7 @@ _KINDS = r"dinov3_vit|dinov2|dinov2_with_registers|vit_\w+_dinov3(_qkvb)?"
 """Names of models in transformers ("model_type") and, with "vit", in timm ("architecture")."""
 
 
-def _constants(gated_mlp: bool) -> dict[str, Any]:
+def _constants(gated_mlp: bool) -> JsonObject:
     """Return the fields of Hugging Face's config for which only one value is supported."""
     return {
         "model_type": "dinov3_vit",
@@ -73,8 +72,10 @@ _DINOV2_CONSTANTS = {"layer_norm_eps": 1e-6, "qkv_bias": True, "hidden_act": "ge
 
 # Names -------------------------------------------------------------------------------
 
-_CLASS, _REGISTERS = "embeddings.cls_token", "embeddings.register_tokens"
-_POSITIONS, _PERIODS = "embeddings.position_embeddings", "rope_embed.periods"
+_CLASS = "embeddings.cls_token"
+_REGISTERS = "embeddings.register_tokens"
+_POSITIONS = "embeddings.position_embeddings"
+_PERIODS = "rope_embed.periods"
 _RULES: Rules = (
     (r"^prefix_tokens", _CLASS),
     (r"^position_embedding", _POSITIONS),
@@ -118,7 +119,7 @@ _DINOV2: Rules = (  # in Hugging Face, where transformers 5 adds "model." to som
 )
 
 
-def to_hugging_face(tensors: StateDict) -> dict[str, Any]:
+def to_hugging_face(tensors: StateDict) -> dict[str, np.ndarray]:
     """Return the tensors of any source under DINOv3's names in Hugging Face."""
     tensors = dict(tensors)
     if "blocks.0.gamma_1" in tensors and not any(n.endswith("_bias") for n in tensors):
@@ -126,7 +127,7 @@ def to_hugging_face(tensors: StateDict) -> dict[str, Any]:
         for name in [n for n in tensors if n.endswith(".attn.qkv.weight")]:
             zeros = np.zeros(np.shape(tensors[name])[:1], np.float32)
             tensors[name.replace(".weight", ".bias")] = zeros
-    renamed: dict[str, Any] = {}
+    renamed = dict[str, np.ndarray]()
     for name, value in tensors.items():
         mask = tensors.get(f"{name}_mask", np.ones(()))
         if mask.shape == value.shape:  # otherwise, the bias of the key is unexpected
@@ -143,7 +144,7 @@ def to_hugging_face(tensors: StateDict) -> dict[str, Any]:
 # Files -------------------------------------------------------------------------------
 
 
-def load(folder: PathLike) -> tuple[ViT, dict[str, Any]]:
+def load(folder: PathLike) -> tuple[ViT, MutableVariableDict]:
     """Load model and variables from a download.
 
     Args:
@@ -160,7 +161,8 @@ def load(folder: PathLike) -> tuple[ViT, dict[str, Any]]:
             shape. The message lists up to 20 of them, with DINOv3's names in Hugging Face.
         UserError: The folder contains another kind of model.
     """
-    path, config = files.as_path(folder), {}
+    path = files.as_path(folder)
+    config: JsonObject = {}
     if not path.is_file():
         config = _read_config(path)
         path = path / WEIGHTS_FILE
@@ -174,7 +176,7 @@ def load(folder: PathLike) -> tuple[ViT, dict[str, Any]]:
     return model, {"params": to_params(model, tensors, source)}
 
 
-def _read_config(folder: pathlib.Path) -> dict[str, Any]:
+def _read_config(folder: pathlib.Path) -> JsonObject:
     """Read the config of a model of Hugging Face or timm after checking what it describes."""
     if (folder / f"{WEIGHTS_FILE}.index.json").is_file():
         raise UserError(
@@ -189,13 +191,14 @@ def _read_config(folder: pathlib.Path) -> dict[str, Any]:
         )
     config = files.read_object(folder / CONFIG_FILE)
     name = "architecture" if "architecture" in config else "model_type"
-    kind, field = config.get(name), f"{folder / CONFIG_FILE}: {name}"
+    kind = config.get(name)
     is_known = re.fullmatch(_KINDS, str(kind)) is not None
+    field = f"{folder / CONFIG_FILE}: {name}"
     require(is_known, field, kind, "a ViT of DINOv3 or DINOv2")
     return config
 
 
-def save(model: ViT, params: Mapping[str, Any], folder: PathLike) -> None:
+def save(model: ViT, params: Collection, folder: PathLike) -> None:
     """Write a model to a folder that `load` and Hugging Face transformers can read.
 
     Args:
@@ -203,8 +206,9 @@ def save(model: ViT, params: Mapping[str, Any], folder: PathLike) -> None:
         params: Parameters of the model, such as `load(folder)[1]["params"]`.
         folder: Folder, which is created if necessary. Existing files are replaced.
     """
-    options, name = model.options, "position_grid"
-    require(not options.position_grid, name, options.position_grid, "0, DINOv3")
+    options = model.options
+    grid = options.position_grid
+    require(not grid, "position_grid", grid, "0, DINOv3")
     folder = files.as_path(folder)
     config = {theirs: getattr(options, ours) for theirs, ours in _FIELDS.items()}
     config |= _constants(options.gated_mlp)
@@ -215,9 +219,7 @@ def save(model: ViT, params: Mapping[str, Any], folder: PathLike) -> None:
         file.write(content)
 
 
-def model_from_config(
-    config: Mapping[str, Any], sizes: ViTOptions | None = None
-) -> ViT:
+def model_from_config(config: JsonObject, sizes: ViTOptions | None = None) -> ViT:
     """Create the model that a Hugging Face `config.json` describes.
 
     Args:
@@ -278,14 +280,14 @@ def model_from_tensors(tensors: StateDict, source: str) -> ViT:
     return ViT(options)
 
 
-def image_fields(options: ViTOptions) -> dict[str, Any]:
+def image_fields(options: ViTOptions) -> dict[str, object]:
     """Return the fields of `config.model.image` that describe a backbone."""
     return {n: getattr(options, n) for n in (*_FIELDS.values(), "position_grid")}
 
 
 def to_params(
     model: ViT, tensors: StateDict, source: str = "state dict"
-) -> dict[str, Any]:
+) -> MutableCollection:
     """Convert DINOv3 tensors by name to the parameters of `model`.
 
     Raises:
@@ -309,13 +311,13 @@ def to_params(
     return convert.from_torch(_RULES, shapes, tensors, source, ignored)["params"]
 
 
-def to_tensors(model: ViT, params: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def to_tensors(model: ViT, params: Collection) -> dict[str, np.ndarray]:
     """Invert `to_params` and add a mask token of zeros."""
-    options, params = model.options, dict(params)
+    options = model.options
     size = options.patch_size
     patches = dict(params["patch_embed"])
     patches["kernel"] = np.reshape(patches["kernel"], (size, size, 3, -1))
-    tensors = convert.to_torch(_RULES, {"params": params | {"patch_embed": patches}})
+    tensors = convert.to_torch(_RULES, {"params": {**params, "patch_embed": patches}})
     tokens = tensors[_CLASS]
     tensors[_CLASS] = np.ascontiguousarray(tokens[:, :1])
     if options.num_registers:

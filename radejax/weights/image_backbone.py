@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping
-from typing import Any
 
 import jax
 import numpy as np
 import safetensors.numpy
+from flax.typing import Collection, VariableDict
 
 from radejax import models
 from radejax.core.errors import UserError
@@ -20,12 +19,12 @@ from radejax.core.files import PathLike, differences
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.radenet import RadeNet
 from radejax.weights import convert, dinov3_hf
-from radejax.weights.convert import Rules
+from radejax.weights.convert import Rules, StateDict
 
 
 def load_image_backbone(
     path: PathLike | None, model: RadeNet, embeddings_sha256: str | None = None
-) -> Mapping[str, Any] | None:
+) -> VariableDict | None:
     """Load pretrained variables for `radejax.training.step.with_pretrained`.
 
     Args:
@@ -81,7 +80,7 @@ def load_image_backbone(
     return part
 
 
-def check_same_backbone(params: Any, sha256: str, source: PathLike) -> None:
+def check_same_backbone(params: Collection, sha256: str, source: PathLike) -> None:
     """Raise a `UserError` unless weights have the checksum of a run or of embeddings.
 
     Args:
@@ -98,9 +97,10 @@ def check_same_backbone(params: Any, sha256: str, source: PathLike) -> None:
         )
 
 
-def check_fits(model: RadeNet, variables: Mapping[str, Any], source: PathLike) -> None:
+def check_fits(model: RadeNet, variables: VariableDict, source: PathLike) -> None:
     """Raise a `UserError` unless variables fit a model; the backbone may be missing."""
-    wanted, found = convert.variable_shapes(model), convert.shapes_of(variables)
+    wanted = convert.variable_shapes(model)
+    found = convert.shapes_of(variables)
     if IMAGE_BACKBONE not in variables.get("params", {}):
         wanted = {k: s for k, s in wanted.items() if f"/{IMAGE_BACKBONE}/" not in k}
     if lines := differences(found, wanted, ""):
@@ -110,7 +110,7 @@ def check_fits(model: RadeNet, variables: Mapping[str, Any], source: PathLike) -
         )
 
 
-def weights_sha256(params: Mapping[str, Any]) -> str:
+def weights_sha256(params: Collection) -> str:
     """Return the SHA-256 of the names, shapes and float32 values of a tree of weights."""
     digest = hashlib.sha256()
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
@@ -136,8 +136,8 @@ RESNET_RULES: Rules = (
 
 
 def load_resnet(
-    state_dict_or_path: Mapping[str, Any] | PathLike, model: RadeNet
-) -> dict[str, Any]:
+    state_dict_or_path: StateDict | PathLike, model: RadeNet
+) -> VariableDict:
     """Load the variables of DinoRADE's ResNet from torchvision's `resnet50-*.pth`.
 
     Args:
@@ -163,7 +163,7 @@ def load_resnet(
     return convert.from_torch(RESNET_RULES, shapes, tensors, source, r"fc\.")
 
 
-def save_resnet(params: Mapping[str, Any], path: PathLike) -> None:
+def save_resnet(params: Collection, path: PathLike) -> None:
     """Write the parameters of a `ResNetTrunk` to a safetensors file with torchvision's names."""
     trunk = {"params": {"image_backbone": params}}
     safetensors.numpy.save_file(convert.to_torch(RESNET_RULES, trunk), path)

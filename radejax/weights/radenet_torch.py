@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
+from flax.typing import MutableVariableDict, VariableDict
 
 from radejax import models
 from radejax.core.errors import DataError, UserError
@@ -22,8 +22,8 @@ _UNUSED_CBAM = r"(rad_)?backbone\.cbam_"  # official models without CBAM have th
 
 
 def read(
-    tensors: StateDict, source: str, **model_overrides: Any
-) -> tuple[RadeNetOptions, dict[str, Any]]:
+    tensors: StateDict, source: str, **model_overrides: object
+) -> tuple[RadeNetOptions, MutableVariableDict]:
     """Return the options and the variables of tensors by official name.
 
     The maps include the padding; their grid for official weights is
@@ -52,7 +52,7 @@ def read(
     return options, convert.from_torch(names, shapes, tensors, source, _UNUSED_CBAM)
 
 
-def save(model: RadeNet, variables: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def save(model: RadeNet, variables: VariableDict) -> dict[str, np.ndarray]:
     """Return a state dict that the official code can load; this is the inverse of `read`.
 
     To write a file, use `safetensors.numpy.save_file(state, path)`, or `torch.save` after
@@ -97,8 +97,8 @@ def save(model: RadeNet, variables: Mapping[str, Any]) -> dict[str, np.ndarray]:
 
 
 def infer_fields(
-    tensors: StateDict, source: str, overrides: Mapping[str, Any], prefix: str = ""
-) -> dict[str, Any]:
+    tensors: StateDict, source: str, overrides: Mapping[str, object], prefix: str = ""
+) -> dict[str, object]:
     """Infer fields of `config.model` from names and shapes, and apply the overrides.
 
     Args:
@@ -129,7 +129,7 @@ def infer_fields(
     levels = len({n.split(".")[1] for n in tensors if n.startswith(encoder)})
     is_expanded = "head.heatmap_head.head.6.weight" in tensors
     last = f"head.heatmap_head.head.{9 if is_expanded else 3}.bias"
-    fields: dict[str, Any] = {
+    fields: dict[str, object] = {
         "num_classes": size(last, 0),
         "widths": tuple(width(f"encoder_block_{i + 1}") for i in range(levels)),
         "decoder_width": width(f"decoder_block_{levels}"),

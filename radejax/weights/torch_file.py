@@ -36,7 +36,7 @@ _DTYPES = {
 _MAX_DIMS = 16
 
 
-def read(path: PathLike) -> Any:
+def read(path: PathLike) -> object:
     """Read the content of a `.pth` file, with tensors as NumPy arrays.
 
     Args:
@@ -100,12 +100,12 @@ def _rebuild_parameter(data: np.ndarray, *unused: object) -> np.ndarray:
     return data
 
 
-def _new_dict() -> dict[str | int, Any]:
+def _new_dict() -> dict[str | int, object]:
     """Return a dict for an `OrderedDict`, which later instructions fill."""
     return {}
 
 
-_ALLOWED: dict[tuple[str, str], Any] = {
+_ALLOWED: dict[tuple[str, str], object] = {
     ("torch._utils", "_rebuild_tensor_v2"): _rebuild_tensor,
     ("torch._utils", "_rebuild_parameter"): _rebuild_parameter,
     ("collections", "OrderedDict"): _new_dict,
@@ -131,11 +131,12 @@ class _Unpickler(pickle._Unpickler):
         code: pickle._Unpickler.dispatch[code] for code in _OPCODES
     }
 
-    stack: list[Any]
-    pop_mark: Callable[[], list[Any]]
+    stack: list[object]
+    pop_mark: Callable[[], list[object]]
 
     def __init__(self, archive: zipfile.ZipFile, root: str) -> None:
-        self._archive, self._root = archive, root
+        self._archive = archive
+        self._root = root
         # All members together may use memory in proportion to the file's size.
         self._budget = 4 * os.path.getsize(str(archive.filename)) + (1 << 20)
         has_order = f"{root}byteorder" in archive.namelist()
@@ -149,7 +150,7 @@ class _Unpickler(pickle._Unpickler):
         self._budget -= len(content)
         return content
 
-    def find_class(self, module: str, name: str) -> Any:
+    def find_class(self, module: str, name: str) -> object:
         if (module, name) not in _ALLOWED:
             raise DataError(
                 f"holds {module}.{name}, which is not read: save the state dict, "
@@ -180,15 +181,16 @@ class _Unpickler(pickle._Unpickler):
         self.stack.pop()
 
     def _set_item(self) -> None:
-        value, key = self.stack.pop(), self.stack.pop()
-        self._update([key, value])
+        value = self.stack.pop()
+        self._update([self.stack.pop(), value])
 
     def _set_items(self) -> None:
         self._update(self.pop_mark())
 
-    def _update(self, items: list[Any]) -> None:
+    def _update(self, items: list[object]) -> None:
         """Check keys before adding them, as hashing nested tuples can take unlimited time."""
-        target, keys = self.stack[-1], items[::2]
+        target = self.stack[-1]
+        keys = items[::2]
         if type(target) is not dict or any(type(k) not in (str, int) for k in keys):
             raise DataError("a dict whose keys are neither names nor integers")
         target.update(zip(keys, items[1::2], strict=True))
