@@ -261,7 +261,8 @@ def _read_text(config: Config, name: str, text: str) -> object:
     *sections, field = name.split(".")
     place: object = config
     for section in sections:
-        place = place[section] if isinstance(place, dict) else getattr(place, section)
+        is_mapping = isinstance(place, Mapping)
+        place = place[section] if is_mapping else getattr(place, section)
     literal = _literal(text)
     info = getattr(type(place), "model_fields", {}).get(field)
     if info is None:  # a weight, or a parameter of the simulated radar

@@ -102,7 +102,7 @@ class Options(pydantic.BaseModel):
         for name, value in self:
             if isinstance(value, Options):
                 yield from ((f"{name}.{inner}", x) for inner, x in value.fields())
-            elif isinstance(value, dict):
+            elif isinstance(value, Mapping):
                 yield from ((f"{name}.{inner}", x) for inner, x in value.items())
             else:
                 yield name, value

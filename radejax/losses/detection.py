@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import pydantic
+from flax.core import freeze
 from jaxtyping import Bool, Float, Int, Num
 
 from radejax.core.errors import require
@@ -51,9 +52,11 @@ class LossOptions(Options, section="config.loss"):
     decode, as in the paper)."""
     own_terms: tuple[str, ...] = ()
     """Other loss terms, each module:function."""
-    weights: dict[str, NotNegative] = pydantic.Field(
-        default={"focal": 2.0, "gwd": 1.0, "smooth_l1": 1.0}
-    )
+    weights: Annotated[
+        Mapping[str, NotNegative],
+        pydantic.AfterValidator(freeze),
+        pydantic.PlainSerializer(dict),
+    ] = freeze({"focal": 2.0, "gwd": 1.0, "smooth_l1": 1.0})
     """Weight of every loss term: focal, gwd, smooth_l1 and the functions of `own_terms` by
     name. A loss without a weight is not computed."""
     normalize: bool = True
@@ -73,7 +76,7 @@ class LossOptions(Options, section="config.loss"):
             "all of own_terms"
         )
         is_fine = is_complete and any(self.weights.values())
-        require(is_fine, "config.loss.weights", self.weights, expected)
+        require(is_fine, "config.loss.weights", dict(self.weights), expected)
         return self
 
     def find_terms(self) -> dict[str, Callable[..., Float[jax.Array, ""]]]:
