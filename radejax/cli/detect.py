@@ -145,8 +145,8 @@ def export(
 
     entry.set_up_jax()
     detector = radejax.Detector.from_workdir(source, image_backbone=image_backbone)
-    done = exporting.export(detector, out, **settings)
-    text = f"{done['bytes'] / 2**20:.1f} MiB written to {out}"
-    if done["left_out"]:
-        text += f", without {', '.join(done['left_out'])}"
+    num_bytes, left_out = exporting.export(detector, out, **settings)
+    text = f"{num_bytes / 2**20:.1f} MiB written to {out}"
+    if left_out:
+        text += f", without {', '.join(left_out)}"
     click.echo(text)

@@ -7,15 +7,16 @@ import dataclasses
 import functools
 import logging
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax.typing import VariableDict
 from jax.sharding import NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
-from jaxtyping import Float, Real, Shaped
+from jaxtyping import Float, PyTree, Real, Shaped
 
 from radejax import models
 from radejax.core.errors import require
@@ -35,18 +36,22 @@ from radejax.inference.inputs import (
     Settings,
 )
 from radejax.inference.saved import SavedModel, Step, load_model, load_torch
+from radejax.weights.convert import StateDict
 
 _log = logging.getLogger(__name__)
+
+Item = Frames | Batch | tuple[Frames, Images | None, Calibrations | None]
+"""Item of `Detector.stream`: frames, or a tuple of frames, image and camera."""
 
 
 def detect(
     model: nn.Module,
     grid: RadarGrid,
     options: DecodeOptions,
-    variables: Any,
+    variables: VariableDict,
     frames: Real[Array, "B R A DE"] | Real[Array, "B D R E A"],
     image: Real[Array, "B _ _ _"] | None = None,
-    camera: Any = None,
+    camera: PyTree[Array] | None = None,
     settings: Settings | None = None,
 ) -> Detections:
     """Compute detections from a batch of radar tensors.
@@ -125,8 +130,8 @@ class Detector:
             config = config.replace(model={"dtype": dtype})
         self.saved = dataclasses.replace(saved, config=config)
         self.grid = saved.grid
-        self.model: Any = self.saved.model
-        self.num_frames: int = self.model.num_frames
+        self.model = self.saved.model
+        self.num_frames = self.model.num_frames
         self.takes_camera = models.has_camera(self.model)
         self.camera_options = config.data.used_camera
         self._reader = InputReader(self.model, self.grid, config.data)
@@ -186,7 +191,7 @@ class Detector:
     @classmethod
     def from_torch(
         cls,
-        path_or_state_dict: PathLike | Mapping[str, Any],
+        path_or_state_dict: PathLike | StateDict,
         *,
         image_backbone: PathLike | None = None,
         **options: Any,
@@ -204,7 +209,7 @@ class Detector:
     def replace(
         self,
         *,
-        variables: Mapping[str, Any] | None = None,
+        variables: VariableDict | None = None,
         batch_sizes: Sequence[int] | None = None,
     ) -> Detector:
         """Return a copy with other variables or batch sizes that shares compiled programs.
@@ -280,14 +285,15 @@ class Detector:
             with self._lock:
                 self.num_radar_only += missing
         reading.check_backbone(inputs.image, self.variables)
-        parts = []
+        parts = list[Detections]()
         largest = self._batch_sizes[-1]
         for start in range(0, len(inputs.radar), largest):
             chunk = jax.tree.map(lambda x, s=start: x[s : s + largest], inputs)
             parts.append(self._detect(chunk, settings, is_checked))
         if len(parts) == 1:
             return parts[0]
-        return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+        found: Detections = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
+        return found
 
     def _detect(
         self, inputs: Inputs, settings: Settings, is_checked: bool
@@ -299,15 +305,16 @@ class Detector:
         # The check is awaited after the network was started, so that the device is not idle
         # meanwhile.
         extremes = None if is_checked else self._extremes(inputs.radar)
-        found = self._run(self.variables, *inputs, settings)
+        found: Detections = self._run(self.variables, *inputs, settings)
         if extremes is not None:
             self._count_invalid(inputs.radar, extremes, count)
         if jax.default_backend() == "cpu" and len(self.sharding.device_set) > 1:
             # With several batches in flight, CPU devices that share cores can fail to
             # synchronize.
             jax.block_until_ready(found)
-        found = found.replace(class_names=self.classes)
-        return found if count == size else jax.tree.map(lambda x: x[:count], found)
+        if count < size:
+            found = jax.tree.map(lambda x: x[:count], found)
+        return found.replace(class_names=self.classes)
 
     def _count_invalid(
         self, frames: Real[Array, "B ..."], extremes: reading.Extremes, count: int
@@ -366,7 +373,7 @@ class Detector:
         # Invalid frames were counted; those of arrays on a device are not counted again.
         return jnp.asarray(known[rows]), known[-past:]
 
-    def stream(self, frames: Iterable[Any], **settings: Any) -> Iterator[Detections]:
+    def stream(self, frames: Iterable[Item], **settings: Any) -> Iterator[Detections]:
         """Yield the detections of items in order, with up to two items in flight.
 
         The next item is read and prepared while the device processes the current one.
@@ -393,28 +400,31 @@ class Detector:
                 yield started.pop(0)
         yield from started
 
-    def warmup(self, *sample: Any) -> Detector:
+    def warmup(
+        self,
+        sample: int | Frames | Batch = 1,
+        image: Images | None = None,
+        camera: Calibrations | None = None,
+    ) -> Detector:
         """Compile the model, so that the first call is fast.
 
         Args:
-            *sample: Arguments of a call like those to come, such as one tesseract; or the
-                batch size of projections (and images, for a radar-camera model), 1 by
-                default.
+            sample: Frames like those of later calls, such as one tesseract; or the batch
+                size of projections (and images, for a radar-camera model).
+            image: Images like those of later calls.
+            camera: Calibrations like those of later calls.
 
         Returns:
             The detector itself.
         """
-        if sample and not isinstance(sample[0], int):
-            jax.block_until_ready(self(*sample))
-            return self
-        batch_size = sample[0] if sample else 1
-        steps = (self.num_frames,) if self.num_frames > 1 else ()
-        shape = (batch_size, *steps, *self.grid.projection_shape)
-        inputs: tuple[Any, ...] = (np.zeros(shape, np.float32),)
-        if self.takes_camera:
-            images, camera = no_images(batch_size, self.model.options.image.size)
-            inputs += images, camera.replace(is_valid=np.ones(batch_size, bool))
-        jax.block_until_ready(self(*inputs))
+        if isinstance(sample, int):
+            count = sample
+            steps = (self.num_frames,) if self.num_frames > 1 else ()
+            sample = np.zeros((count, *steps, *self.grid.projection_shape), np.float32)
+            if models.has_camera(self.model):
+                image, blank = no_images(count, self.model.options.image.size)
+                camera = blank.replace(is_valid=np.ones(count, bool))
+        jax.block_until_ready(self(sample, image, camera))
         return self
 
     def detect_function(self) -> Callable[..., Detections]:
@@ -423,23 +433,27 @@ class Detector:
         grid = models.map_grid(self.grid, self.model, mapping)
         return functools.partial(detect, self.model, grid, self.decode_options)
 
-    def put(self, x: Shaped[Any, "b ..."]) -> Shaped[jax.Array, "B ..."]:
+    def put(self, x: Shaped[Array, "b ..."]) -> Shaped[jax.Array, "B ..."]:
         """Copy the rows of this process to the devices; the caller may then reuse `x`.
 
         NumPy arrays need care: on CPU, `device_put` shares aligned memory regardless of
         `may_alias`, so the array is copied first; on other platforms the transfer is
         asynchronous, so the call waits for it.
         """
+        placed: jax.Array
+        is_cpu = jax.default_backend() == "cpu"
         if not isinstance(x, np.ndarray):
-            return jax.device_put(x, self.sharding)
-        if not x.flags.c_contiguous and _reversed(x).flags.c_contiguous:
+            placed = jax.device_put(x, self.sharding)
+        elif not x.flags.c_contiguous and _reversed(x).flags.c_contiguous:
             # Frames of column-major tensors, such as `scipy.io.loadmat` returns, are copied
             # as they are stored: the device reorders them faster than the host.
-            return _reverse(self.put(_reversed(x)))
-        is_cpu = jax.default_backend() == "cpu"
-        x = x.copy() if is_cpu else x
-        placed = jax.make_array_from_process_local_data(self.sharding, x)
-        return placed if is_cpu else jax.block_until_ready(placed)
+            placed = _reverse(self.put(_reversed(x)))
+        elif is_cpu:
+            placed = jax.make_array_from_process_local_data(self.sharding, x.copy())
+        else:
+            placed = jax.make_array_from_process_local_data(self.sharding, x)
+            jax.block_until_ready(placed)
+        return placed
 
 
 def _reversed(x: Shaped[Any, "B ..."]) -> Shaped[Any, "B ..."]:

@@ -5,17 +5,17 @@ They are records, but `data` cannot compute them, as it uses neither models nor 
 
 from __future__ import annotations
 
-import os
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import grain
 import jax
 import numpy as np
 import tqdm
+from flax.typing import VariableDict
 from jaxtyping import UInt8
 
 from radejax.core.errors import UserError
+from radejax.core.files import PathLike
 from radejax.data.cameras import read_left_image
 from radejax.data.dataset import LabelledFrame
 from radejax.data.records import Records, embedding_fields
@@ -25,9 +25,9 @@ from radejax.weights.image_backbone import weights_sha256
 
 def embed_dataset(
     model: DinoRade,
-    variables: Mapping[str, Any],
+    variables: VariableDict,
     frames: Sequence[LabelledFrame],
-    folder: str | os.PathLike,
+    folder: PathLike,
     *,
     dtype: str | None = None,
     resize: bool = False,
@@ -65,7 +65,8 @@ def embed_dataset(
     images = [f for f in frames if f.camera_path is not None and f.key not in keys]
     found = sum(frame.key in keys for frame in frames)
 
-    def read(frame: Any) -> UInt8[np.ndarray, "H W 3"]:
+    def read(frame: LabelledFrame) -> UInt8[np.ndarray, "H W 3"]:
+        assert frame.camera_path is not None
         return read_left_image(
             frame.camera_path,
             model.options.image.size,

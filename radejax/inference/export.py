@@ -12,15 +12,19 @@ import json
 import logging
 import pathlib
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.export  # not a part of `import jax`
 import jax.numpy as jnp
-from flax import traverse_util
+from flax.traverse_util import flatten_dict, unflatten_dict
+from flax.typing import MutableVariableDict, VariableDict
+from jax.typing import DTypeLike
+from jaxtyping import PyTree
 
 import radejax
+from radejax import models
 from radejax.core import files
 from radejax.core.errors import UserError, require
 from radejax.core.structures import to_float
@@ -85,7 +89,7 @@ def export(
     batch_size: int | None = None,
     half: bool = False,
     radar_input: str = "projection",
-) -> dict[str, Any]:
+) -> tuple[int, list[str]]:
     """Write a folder with the model; files of an earlier export are replaced or removed.
 
     Args:
@@ -104,8 +108,8 @@ def export(
         radar_input: Radar data with which the program begins, from `INPUTS`.
 
     Returns:
-        "bytes", the size of all files in the folder, and "left_out", the names of the
-        variables that were not written.
+        The size of all files in the folder in bytes, and the names of the variables that
+        were not written.
 
     Raises:
         UserError: The kind or a platform is unknown, jax2onnx is not installed for ONNX,
@@ -138,7 +142,7 @@ def export(
     left_out = content["left_out"]
     files.write_text(folder / "README.md", _readme(detector, shape, left_out))
     num_bytes = sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
-    return {"bytes": num_bytes, "left_out": left_out}
+    return num_bytes, left_out
 
 
 def _radar_shape(detector: Detector, radar_input: str) -> tuple[int, ...]:
@@ -178,8 +182,10 @@ def _readme(detector: Detector, shape: Sequence[int], left_out: Sequence[str]) -
 
 # Programs ----------------------------------------------------------------------------
 
+_Shaped = jax.ShapeDtypeStruct | jax.core.ShapedArray
 
-def _array(*shape: Any, dtype: Any = jnp.float32) -> jax.ShapeDtypeStruct:
+
+def _array(*shape: int, dtype: DTypeLike = jnp.float32) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(shape, dtype)
 
 
@@ -189,7 +195,7 @@ _SETTINGS = {"score_threshold": _array(), "nms_iou": _array(), "roi": _array(6)}
 
 def _exported(
     detector: Detector, shape: Sequence[int], batch: Any, with_backbone: bool
-) -> tuple[dict[str, Any], tuple[Any, ...]]:
+) -> tuple[MutableVariableDict, tuple[PyTree, ...]]:
     """Return the variables of a program and the shapes of its inputs.
 
     The inputs are projections or tensors and, for a radar-camera model, images and a
@@ -198,21 +204,20 @@ def _exported(
     """
     variables = {name: dict(tree) for name, tree in detector.variables.items()}
     radar = _array(batch, *shape)
-    if not detector.takes_camera:
-        return variables, (radar,)
     model = detector.model
-
-    def of_batch(x: Any) -> jax.ShapeDtypeStruct:
-        return _array(batch, *x.shape[1:], dtype=x.dtype)
-
-    image, camera = jax.tree.map(of_batch, no_images(1, model.options.image.size))
+    if not models.has_camera(model):
+        return variables, (radar,)
+    image, camera = jax.tree.map(
+        lambda x: _array(batch, *x.shape[1:], dtype=x.dtype),
+        no_images(1, model.options.image.size),
+    )
     if model.options.image.kind == "vit" and not with_backbone:
         variables["params"].pop(IMAGE_BACKBONE, None)
         image = _array(batch, *model.feature_shape)
     return variables, (radar, image, vars(camera))
 
 
-def _names(shapes: Sequence[Any]) -> list[str]:
+def _names(shapes: Sequence[PyTree]) -> list[str]:
     """Return the names of the leaves of the inputs that `_exported` returns."""
     radar = "projection" if len(shapes[0].shape) == 4 else "tensor"
     names = [radar, "image"][: len(shapes)]
@@ -240,7 +245,7 @@ _UNITS = {
 }
 
 
-def _described(arrays: Iterable[tuple[str, Any]]) -> bytes:
+def _described(arrays: Iterable[tuple[str, _Shaped]]) -> bytes:
     """Return a list of the inputs or outputs of a program as JSON, null for any size."""
     rows = [
         {
@@ -256,13 +261,13 @@ def _described(arrays: Iterable[tuple[str, Any]]) -> bytes:
 
 
 def _detect(
-    detector: Detector, variables: Any, inputs: Sequence[Any], settings: Sequence[Any]
+    detector: Detector, variables: VariableDict, inputs: PyTree, settings: Settings
 ) -> dict[str, jax.Array]:
     """Run the detector on inputs in the shapes of `_exported`, for both program formats."""
     projection, *rest = inputs
     image, camera = (rest[0], Camera(**rest[1])) if rest else (None, None)
     function = detector.detect_function()
-    found = function(variables, projection, image, camera, Settings(*settings))
+    found = function(variables, projection, image, camera, settings)
     return {name: getattr(found, name) for name in RESULTS}
 
 
@@ -282,11 +287,11 @@ def _stablehlo(
     """
     batch = batch_size or jax.export.symbolic_shape("b")[0]
     variables, inputs = _exported(detector, shape, batch, with_backbone)
-    flat = traverse_util.flatten_dict(variables, sep="/")
+    flat = flatten_dict(variables, sep="/")
 
-    def program(weights: Any, inputs: Any, *settings: Any) -> dict[str, jax.Array]:
-        tree = traverse_util.unflatten_dict(weights, sep="/")
-        return _detect(detector, tree, inputs, settings)
+    def program(weights: PyTree, inputs: PyTree, *settings: jax.Array) -> PyTree:
+        tree = unflatten_dict(weights, sep="/")
+        return _detect(detector, tree, inputs, Settings(*settings))
 
     weights = {name: _array(*x.shape) for name, x in flat.items()}
     export_of = jax.export.export(jax.jit(program), platforms=tuple(platforms))
@@ -348,12 +353,18 @@ def _onnx_files(
 
     def program(*arrays: jax.Array) -> list[jax.Array]:
         given = jax.tree.unflatten(tree, arrays[: len(leaves)])
-        found = _detect(detector, variables, given, arrays[len(leaves) :])
+        settings = Settings(*arrays[len(leaves) :])
+        found = _detect(detector, variables, given, settings)
         return list(found.values())
 
-    def convert(function: Any, given: Mapping[str, Any], results: Any) -> bytes:
+    def convert(
+        function: Callable[..., list[jax.Array]],
+        given: Mapping[str, jax.ShapeDtypeStruct],
+        results: Sequence[str],
+    ) -> bytes:
         names = {"input_names": list(given), "output_names": list(results)}
-        return to_onnx(function, list(given.values()), **names).SerializeToString()
+        converted = to_onnx(function, list(given.values()), **names)
+        return bytes(converted.SerializeToString())
 
     every = inputs | _SETTINGS
     outputs = jax.eval_shape(program, *every.values())

@@ -7,6 +7,7 @@ import hashlib
 import json
 import pathlib
 import sys
+from collections.abc import Callable
 
 import jax
 import jax.export
@@ -34,7 +35,9 @@ def read_weights(data: bytes) -> dict[str, np.ndarray]:
     return {n: flat[slice(*ends[n])].reshape(v["shape"]) for n, v in header.items()}
 
 
-def load(folder: str | pathlib.Path = FOLDER, device: jax.Device | None = None):
+def load(
+    folder: str | pathlib.Path = FOLDER, device: jax.Device | None = None
+) -> Callable[..., dict[str, jax.Array]]:
     """Loads the detector of an exported folder as a function `detect(projection, ...)`.
 
     The function returns a dictionary of arrays. Its keyword arguments `score_threshold`,
@@ -49,7 +52,7 @@ def load(folder: str | pathlib.Path = FOLDER, device: jax.Device | None = None):
     defaults = {name: decode[name] for name in ("score_threshold", "nms_iou")}
     defaults["roi"] = decode.get("roi") or [-np.inf, np.inf] * 3
 
-    def detect(*inputs, **settings):
+    def detect(*inputs: object, **settings: object) -> dict[str, jax.Array]:
         if unknown := set(settings) - set(defaults):
             raise TypeError(f"unknown {unknown}, expected {sorted(defaults)}")
         values = [np.asarray(x, np.float32) for x in {**defaults, **settings}.values()]
@@ -58,7 +61,8 @@ def load(folder: str | pathlib.Path = FOLDER, device: jax.Device | None = None):
         # On CPU, device_put shares memory with arrays that the caller may overwrite, so
         # they are copied.
         own = jax.tree.map(np.array, inputs)
-        return run(weights, jax.device_put(own, device), *values)
+        found: dict[str, jax.Array] = run(weights, jax.device_put(own, device), *values)
+        return found
 
     return detect
 

@@ -9,13 +9,14 @@ import contextlib
 import dataclasses
 import os
 import pathlib
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Real, UInt8
+from flax.typing import VariableDict
+from jaxtyping import Bool, Float, PyTree, Real, UInt8
 
 from radejax import models
 from radejax.core.errors import UserError, require
@@ -35,7 +36,8 @@ from radejax.geometry.camera import (
     stack_cameras,
 )
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.models.dinorade import IMAGE_BACKBONE
+from radejax.models.dinorade import IMAGE_BACKBONE, DinoRade
+from radejax.models.radenet import RadeNet
 
 Frames = Array | PathLike | Sequence[Array | PathLike]
 Images = Array | Sequence[Array | PathLike | None]
@@ -57,7 +59,7 @@ class Inputs(NamedTuple):
 
     radar: Real[Array, "B ..."]
     image: Real[Array, "B _ _ _"] | None = None
-    camera: Any = None
+    camera: PyTree[Array] | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,11 +72,11 @@ class InputReader:
         data: Options of the data that the model is for.
     """
 
-    model: Any
+    model: RadeNet
     grid: RadarGrid
     data: DataOptions
 
-    def read_radar(self, frames: Frames, num_frames: int = 1) -> Real[Any, "B ..."]:
+    def read_radar(self, frames: Frames, num_frames: int = 1) -> Real[Array, "B ..."]:
         """Combine radar frames into one array with a leading axis B.
 
         Args:
@@ -91,13 +93,13 @@ class InputReader:
             DataError: A file is corrupted, or shape, dtype or values of a frame differ from
                 those of its reduced release.
         """
-        radar = _read_paths(frames, self._read_file)
-        if isinstance(radar, list):
-            if not radar:
+        found = _read_paths(frames, self._read_file)
+        if isinstance(found, list):
+            if not found:
                 raise UserError("no frames: the list is empty")
-            radar = np.stack([self._projected(frame) for frame in radar])
-        radar = self._projected(radar)
-        shape = tuple(np.shape(radar))
+            found = np.stack([self._projected(frame) for frame in found])
+        radar = self._projected(found)
+        shape = tuple(radar.shape)
         steps = () if num_frames == 1 else (num_frames,)
         projection = self.grid.projection_shape
         tensor = self.grid.shape_drea
@@ -128,7 +130,7 @@ class InputReader:
             )
         return read_frame(path, self.grid)
 
-    def _projected(self, frames: Any) -> Real[Any, "..."]:
+    def _projected(self, frames: object) -> Real[Array, "..."]:
         """Convert to an array that JAX accepts; frames of a reduced release become projections."""
         array = as_numbers(frames, "frames")
         if reduced.is_reduced(array, self.grid):
@@ -171,8 +173,9 @@ class InputReader:
         images = cameras = None
         has_image = np.zeros(num_frames, bool)
         if image is not None:
-            cameras = self._cameras(camera, num_frames, options)
-            images, has_image = self._images(image, cameras, options.resize)
+            none = no_camera(self.model.options.image.size)
+            cameras = _batched(camera, num_frames, none, options)
+            images, has_image = _images(image, cameras, self.model, options.resize)
             given = len(images), len(cameras.is_valid)
             if given != (num_frames, num_frames):
                 raise UserError(
@@ -189,49 +192,52 @@ class InputReader:
             )
         return images, cameras, num_missing
 
-    def _images(
-        self, image: Any, cameras: Camera, resize: bool
-    ) -> tuple[Real[Array, "B _ _ _"], Bool[np.ndarray, " B"]]:
-        """Return the images as one array, and a mask that is True where one is given."""
-        size = self.model.options.image.size
-        calibrated_px = np.asarray(cameras.size_px, int)
 
-        def read(path: pathlib.Path, index: int) -> UInt8[np.ndarray, "H W 3"]:
-            # A wrong number of images is reported later.
-            width, height = calibrated_px[min(index, len(calibrated_px) - 1)]
-            return read_left_image(
-                path, size, resize=resize, calibrated_size=(height, width)
-            )
+def _images(
+    given: Images, cameras: Camera, model: DinoRade, resize: bool
+) -> tuple[Real[Array, "B _ _ _"], Bool[np.ndarray, " B"]]:
+    """Return the images as one array, and a mask that is True where one is given."""
+    size = model.options.image.size
+    calibrated_px = np.asarray(cameras.size_px, int)
 
-        image = _read_paths(image, read)
-        if isinstance(image, list):
-            has_image = np.array([one is not None for one in image])
-            empty = np.zeros((*size, 3), np.uint8)
-            if has_image.any():
-                empty = np.zeros_like(np.asarray(image[has_image.argmax()]))
-            image = np.stack([empty if one is None else one for one in image])
-        else:
-            image = as_numbers(image, "image")
-            image = image[None] if image.ndim == 3 else image
-            has_image = np.ones(len(image), bool)
-        shapes = (*size, 3), self.model.feature_shape
-        if image.shape[1:] not in shapes:
-            expected = " or embedded ones ".join(f"[B, {str(s)[1:-1]}]" for s in shapes)
-            raise UserError(f"image has shape {list(image.shape)}, expected {expected}")
-        if image.dtype != np.uint8 and not jnp.issubdtype(image.dtype, jnp.floating):
-            raise UserError(f"image has dtype {image.dtype}, expected uint8")
-        return image, has_image
-
-    def _cameras(self, camera: Any, num_frames: int, options: CameraOptions) -> Camera:
-        """Combine the cameras of all frames into one batched `Camera`."""
-        if isinstance(camera, Camera) and np.ndim(camera.is_valid) == 1:
-            return camera
-        if not isinstance(camera, list | tuple):
-            camera = [camera] * num_frames
-        none = no_camera(self.model.options.image.size)
-        return stack_cameras(
-            [none if one is None else _one_camera(one, options) for one in camera]
+    def read(path: pathlib.Path, index: int) -> UInt8[np.ndarray, "H W 3"]:
+        # A wrong number of images is reported later.
+        width, height = calibrated_px[min(index, len(calibrated_px) - 1)]
+        return read_left_image(
+            path, size, resize=resize, calibrated_size=(height, width)
         )
+
+    found = _read_paths(given, read)
+    if isinstance(found, list):
+        has_image = np.array([one is not None for one in found])
+        empty = np.zeros((*size, 3), np.uint8)
+        if has_image.any():
+            empty = np.zeros_like(np.asarray(found[has_image.argmax()]))
+        image: Array = np.stack([empty if one is None else one for one in found])
+    else:
+        image = as_numbers(found, "image")
+        image = image[None] if image.ndim == 3 else image
+        has_image = np.ones(len(image), bool)
+    shapes = (*size, 3), model.feature_shape
+    if image.shape[1:] not in shapes:
+        expected = " or embedded ones ".join(f"[B, {str(s)[1:-1]}]" for s in shapes)
+        raise UserError(f"image has shape {list(image.shape)}, expected {expected}")
+    if image.dtype != np.uint8 and not jnp.issubdtype(image.dtype, jnp.floating):
+        raise UserError(f"image has dtype {image.dtype}, expected uint8")
+    return image, has_image
+
+
+def _batched(
+    given: Calibrations | None, num_frames: int, none: Camera, options: CameraOptions
+) -> Camera:
+    """Combine the cameras of all frames, `none` for missing ones, into one `Camera`."""
+    if isinstance(given, Camera) and np.ndim(given.is_valid) == 1:
+        return given
+    if given is None or isinstance(given, (Camera, CameraCalibration, _PATH)):
+        given = [given] * num_frames
+    return stack_cameras(
+        [none if one is None else _one_camera(one, options) for one in given]
+    )
 
 
 def _one_camera(camera: Camera | Calibration, options: CameraOptions) -> Camera:
@@ -249,13 +255,15 @@ def _one_camera(camera: Camera | Calibration, options: CameraOptions) -> Camera:
     return camera.camera(options.projection)
 
 
-def _read_paths(given: Any, read: Callable[[pathlib.Path, int], np.ndarray]) -> Any:
+def _read_paths(
+    given: Frames | Images, read: Callable[[pathlib.Path, int], np.ndarray]
+) -> Array | list[Array | None]:
     """Replace paths by the arrays that they contain.
 
     An array is returned unchanged. A path or a list becomes a list of arrays and None.
     `read` is called with the path and its position in the list.
     """
-    if not isinstance(given, str | os.PathLike | Sequence):
+    if not isinstance(given, (_PATH, Sequence)):
         return given
     entries = [given] if isinstance(given, _PATH) else given
     return [
@@ -264,7 +272,7 @@ def _read_paths(given: Any, read: Callable[[pathlib.Path, int], np.ndarray]) -> 
     ]
 
 
-def as_numbers(values: Any, name: str) -> Any:
+def as_numbers(values: object, name: str) -> Real[Array, "..."]:
     """Convert an array of any kind of real numbers to one that JAX accepts.
 
     Args:
@@ -276,8 +284,7 @@ def as_numbers(values: Any, name: str) -> Any:
     """
     if isinstance(values, jax.Array):
         return values
-    if np.ma.is_masked(values):
-        count = np.ma.count_masked(values)
+    if isinstance(values, np.ma.MaskedArray) and (count := np.sum(values.mask)):
         raise UserError(
             f"{name}: {count} values are masked; fill them: array.filled(x)"
         )
@@ -291,7 +298,7 @@ def as_numbers(values: Any, name: str) -> Any:
 
 
 def check_backbone(
-    image: Real[Array, "B _ _ _"] | None, variables: Mapping[str, Any]
+    image: Real[Array, "B _ _ _"] | None, variables: VariableDict
 ) -> None:
     """Check that the variables contain the image backbone if images require it.
 
@@ -323,7 +330,7 @@ class Settings(NamedTuple):
     roi: Float[Array, "6"]
 
     @classmethod
-    def of(cls, options: DecodeOptions, changes: dict[str, Any]) -> Settings:
+    def of(cls, options: DecodeOptions, changes: dict[str, object]) -> Settings:
         """Return the values of options, and those that replace them, as float32 arrays."""
         values = dict(options) | changes
         return cls(
@@ -337,21 +344,21 @@ def check_settings(
     score_threshold: float | None,
     nms_iou: float | None,
     roi: Sequence[float] | str | None,
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Return the given values as fields of `DecodeOptions`, without those that are None.
 
     Raises:
         UserError: A value is out of its range.
     """
     given = {"score_threshold": score_threshold, "nms_iou": nms_iou}
-    settings: dict[str, Any] = {k: float(v) for k, v in given.items() if v is not None}
-    for name, value in settings.items():
-        require(0 <= value <= 1, name, value, "a number from 0 to 1")
-    if roi is not None:
-        limits = ROIS.get(roi, ()) if isinstance(roi, str) else tuple(roi)
-        require(is_roi(limits), "roi", roi, f"narrow, wide or {ROI_LIMITS}")
-        settings["roi"] = limits
-    return settings
+    numbers = {name: float(x) for name, x in given.items() if x is not None}
+    for name, number in numbers.items():
+        require(0 <= number <= 1, name, number, "a number from 0 to 1")
+    if roi is None:
+        return {**numbers}
+    limits = ROIS.get(roi, ()) if isinstance(roi, str) else tuple(roi)
+    require(is_roi(limits), "roi", roi, f"narrow, wide or {ROI_LIMITS}")
+    return {**numbers, "roi": limits}
 
 
 # Values that cannot be radar power ---------------------------------------------------

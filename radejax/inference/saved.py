@@ -17,18 +17,19 @@ import hashlib
 import logging
 import pathlib
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import safetensors.numpy
-from flax import traverse_util
+from flax.traverse_util import flatten_dict, unflatten_dict
+from flax.typing import VariableDict
 
 import radejax
 from radejax import models
 from radejax.config import Config
 from radejax.core import files
 from radejax.core.errors import DataError, UserError, require
-from radejax.core.files import PathLike
+from radejax.core.files import JsonObject, PathLike
 from radejax.data.kradar.labels import LABEL_CLASSES
 from radejax.data.options import CameraOptions, DataOptions
 from radejax.detection.decode import DecodeOptions
@@ -38,7 +39,7 @@ from radejax.models.lifting import OFFICIAL_OFFSET_M
 from radejax.models.options import DinoRadeOptions, RadeNetOptions
 from radejax.models.radenet import RadeNet
 from radejax.weights import dinorade_torch, image_backbone, radenet_torch
-from radejax.weights.convert import check_finite, read_state_dict
+from radejax.weights.convert import StateDict, check_finite, read_state_dict
 
 _log = logging.getLogger(__name__)
 
@@ -70,9 +71,9 @@ class SavedModel:
 
     config: Config
     grid: RadarGrid
-    variables: Mapping[str, Any]
+    variables: VariableDict
     step: int | None = None
-    run: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    run: JsonObject = dataclasses.field(default_factory=dict)
 
     @property
     def model(self) -> RadeNet:
@@ -116,10 +117,10 @@ def load_model(
 
 
 def load_torch(
-    path_or_state_dict: PathLike | Mapping[str, Any],
+    path_or_state_dict: PathLike | StateDict,
     *,
     image_backbone: PathLike | None = None,
-    **model_overrides: Any,
+    **model_overrides: object,
 ) -> SavedModel:
     """Load official RADE-Net or DinoRADE weights on the grid of K-Radar.
 
@@ -137,7 +138,7 @@ def load_torch(
     parts = radenet_torch.PART, dinorade_torch.PART
     tensors, source = read_state_dict(path_or_state_dict, *parts)
     model: RadeNetOptions
-    camera: CameraOptions | None = None
+    camera = None
     if any(name.startswith(dinorade_torch.PART) for name in tensors):
         model, variables = dinorade_torch.read(
             tensors, source, image_backbone, **model_overrides
@@ -170,7 +171,7 @@ def save_model(
     with_backbone: bool = False,
     half: bool = False,
     programs: Mapping[str, bytes] | None = None,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Write a model to a folder as `config.json` and `model.safetensors`.
 
     Args:
@@ -203,7 +204,7 @@ def save_model(
         if not with_backbone:
             params.pop(IMAGE_BACKBONE, None)
         is_incomplete = IMAGE_BACKBONE not in params
-    flat = traverse_util.flatten_dict(variables, sep="/")
+    flat = flatten_dict(variables, sep="/")
     dtype = np.float16 if half else None
     arrays = {name: np.ascontiguousarray(x, dtype) for name, x in flat.items()}
     weights = safetensors.numpy.save(arrays, {"format": "jax"})
@@ -239,7 +240,7 @@ def _read_exported(folder: pathlib.Path) -> SavedModel:
             )
         arrays = safetensors.numpy.load(data)
         arrays = {name: value.astype(np.float32) for name, value in arrays.items()}
-        variables = traverse_util.unflatten_dict(arrays, sep="/")
+        variables = unflatten_dict(arrays, sep="/")
         config = Config(**content["config"])
         saved = SavedModel(config, RadarGrid.from_dict(content["grid"]), variables)
         image_backbone.check_fits(saved.model, variables, weights)
@@ -299,7 +300,7 @@ def _with_backbone(saved: SavedModel, given: PathLike | None) -> SavedModel:
         return saved
     source = given or config.data.image_backbone
     start = saved.run.get("init_from")
-    found: Any = {"params": {}}
+    found: VariableDict | None = None
     if given is not None or (source and files.as_path(source).exists()):
         found = image_backbone.load_image_backbone(source, saved.model)
     elif start and files.as_path(start).exists() and not config.data.embeddings:
@@ -307,7 +308,7 @@ def _with_backbone(saved: SavedModel, given: PathLike | None) -> SavedModel:
         found = _fitting_variables(start, config.model)
     if source is None:
         return saved
-    backbone = found["params"].get(IMAGE_BACKBONE)
+    backbone = found["params"].get(IMAGE_BACKBONE) if found else None
     if backbone is None:
         _log.warning(
             "image backbone weights not found at %s; the model accepts embedded images "
@@ -329,7 +330,7 @@ def starting_weights(
     init_from: PathLike | None = None,
     image_backbone_path: PathLike | None = None,
     embeddings_sha256: str | None = None,
-) -> tuple[Mapping[str, Any] | None, Mapping[str, Any] | None, str | None]:
+) -> tuple[VariableDict | None, VariableDict | None, str | None]:
     """Read the weights that a training starts from, including frozen ones.
 
     Args:
@@ -349,23 +350,24 @@ def starting_weights(
     Raises:
         UserError: The weights do not fit the model; the message names the differences.
     """
-    model: Any = models.build(options)
-    variables = pretrained = digest = None
+    variables = pretrained = None
     if init_from is not None:
         variables = _fitting_variables(init_from, options)
     if variables is None or IMAGE_BACKBONE not in variables["params"]:
         pretrained = image_backbone.load_image_backbone(
-            image_backbone_path, model, embeddings_sha256
+            image_backbone_path, models.build(options), embeddings_sha256
         )
+    digest = None
     if isinstance(options, DinoRadeOptions) and options.image.freeze:
-        given: Any = variables if pretrained is None else pretrained
+        given = pretrained or variables
+        assert given is not None  # `load_image_backbone` requires frozen weights
         digest = embeddings_sha256 or image_backbone.weights_sha256(
             given["params"][IMAGE_BACKBONE]
         )
     return variables, pretrained, digest
 
 
-def _fitting_variables(path: PathLike, options: RadeNetOptions) -> Mapping[str, Any]:
+def _fitting_variables(path: PathLike, options: RadeNetOptions) -> VariableDict:
     """Read the weights of another run or an official file, which must fit `config.model`."""
     wanted = options.to_dict()
     if files.as_path(path).is_dir():

@@ -59,7 +59,7 @@ class ProgressBar(tqdm.tqdm):
         )
 
     def __call__(self, step: int, state: TrainState, metrics: Metrics) -> None:
-        tqdm.tqdm.update(self, step - self.n)
+        tqdm.tqdm.update(self, step - self.n)  # `self.update` would be untyped
 
 
 class Throughput:

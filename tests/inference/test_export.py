@@ -97,7 +97,7 @@ def _check(found, suffix, expected):
 def test_a_fresh_process_without_radejax_finds_the_same_boxes(tmp_path):
     detector, projection = small.detector(), small.projections(3)
     folder = tmp_path / "exported"
-    done = export.export(detector, folder)
+    num_bytes, _ = export.export(detector, folder)
     names = {path.name for path in folder.iterdir()}
     assert names == {
         "README.md",
@@ -108,7 +108,7 @@ def test_a_fresh_process_without_radejax_finds_the_same_boxes(tmp_path):
         "model.safetensors",
         "outputs.json",
     }
-    assert done["bytes"] > (folder / "model.safetensors").stat().st_size
+    assert num_bytes > (folder / "model.safetensors").stat().st_size
     exported = jax.export.deserialize((folder / "detector.stablehlo").read_bytes())
     assert exported.platforms == ("cpu", "cuda", "tpu")
     assert str(exported.in_avals[-4].shape[0]) == "b"
@@ -225,8 +225,8 @@ def test_a_radar_camera_model_too(with_backbone, tmp_path):
     detector = small.detector("camera")
     inputs, arrays = _camera_inputs(detector, 3, embedded=not with_backbone)
     folder = tmp_path / "exported"
-    done = export.export(detector, folder, with_backbone=with_backbone)
-    assert bool(done["left_out"]) is not with_backbone
+    _, left_out = export.export(detector, folder, with_backbone=with_backbone)
+    assert bool(left_out) is not with_backbone
     found = _run_elsewhere(folder, arrays)
     _check(found, "3", detector(*inputs))
     first = jax.tree.map(lambda x: x[:1], inputs)
@@ -234,8 +234,8 @@ def test_a_radar_camera_model_too(with_backbone, tmp_path):
 
 
 def test_huggingface_files_name_what_is_left_out(tmp_path):
-    done = export.export(small.detector("camera"), tmp_path, kind="huggingface")
-    assert done["left_out"] == ["params/image_backbone"]
+    _, left_out = export.export(small.detector("camera"), tmp_path, kind="huggingface")
+    assert left_out == ["params/image_backbone"]
     card = (tmp_path / "README.md").read_text()
     assert card.startswith("---\nlibrary_name: radejax\n")
     assert "DINOv3" in card

@@ -30,6 +30,7 @@ from jaxtyping import Float, Int, Real
 
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike, as_path
+from radejax.core.structures import Array
 from radejax.data.projection import MAX_ZERO_SHARE, to_log_scale
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -90,7 +91,7 @@ def release_of_file(path: PathLike) -> str | None:
     return name if name in RELEASES else None
 
 
-def is_reduced(frame: Real[np.ndarray, "..."], grid: RadarGrid) -> bool:
+def is_reduced(frame: Real[Array, "..."], grid: RadarGrid) -> bool:
     """Returns True if an array belongs to a reduced release by its shape.
 
     Without a Doppler axis, a `polar3d` frame has the shape of two projections. It is then
