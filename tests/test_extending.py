@@ -290,7 +290,7 @@ def test_own_parts_are_imported_wherever_a_run_is_opened(
     assert metrics["options"]["protocols"] == ["parts:EVERY_FRAME", "all_point"]
     _forget()
     detector = Detector.from_workdir(folder, score_threshold=0.0)
-    found = detect_files(detector, find_inputs(detector, [root]), tmp_path / "boxes")
+    found, _ = detect_files(detector, find_inputs(detector, [root]), tmp_path / "boxes")
     assert found["frames"] == 4
     boxes = json.loads((tmp_path / "boxes" / "1_0001.json").read_text())
     assert {box["frame"] for box in boxes} == {"1/0001"}

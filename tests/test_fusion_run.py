@@ -276,7 +276,7 @@ def test_detect_finds_the_images_by_the_labels(from_images, tmp_path):
     def detect(name):
         out = tmp_path / name
         detector = Detector.from_workdir(from_images, score_threshold=0.0)
-        counts = detect_files(detector, find_inputs(detector, [root]), out)
+        counts, _ = detect_files(detector, find_inputs(detector, [root]), out)
         assert counts["frames"] == len(list(out.iterdir())) == len(frames)
         key = key_of(frames[0].projection_path).replace("/", "_")
         return counts["radar_only"], json.loads((out / f"{key}.json").read_text())

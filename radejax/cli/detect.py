@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import pathlib
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +13,8 @@ from radejax.cli import entry
 
 if TYPE_CHECKING:
     from radejax.inference.saved import Step
+
+_MAX_LISTED = 20
 
 
 @click.command(cls=entry.Command)
@@ -66,7 +69,8 @@ def detect(
     .pth file. A folder is a K-Radar root, a folder with tesseract_*.mat or projection
     files, or such a file itself. No labels are needed; a radar-camera model finds a
     frame's image by its label file, and uses the radar only without. What is
-    written is scored by `radejax score OUT --data ROOT`.
+    written is scored by `radejax score OUT --data ROOT`. Frames with a box that is not
+    finite are listed, with exit code 1.
 
     Example: radejax detect --workdir runs/quickstart --out boxes data/kradar/5
     """
@@ -78,7 +82,7 @@ def detect(
         source, step, image_backbone=image_backbone, **thresholds
     )
     inputs = find_inputs(detector, roots, **options)
-    count = detect_files(
+    count, failed = detect_files(
         detector, inputs, out, batch_size=batch_size, file_format=file_format
     )
     text = f"{count['boxes']} boxes in {count['frames']} frames written to {out}"
@@ -89,7 +93,13 @@ def detect(
     if count.get("radar_only"):
         reason = "without a label file, image or calibration"
         text += f"; {count['radar_only']} {reason}, from the radar only"
-    entry.echo_result(as_json, {**count, "out": str(out)}, text)
+    if failed:
+        text += f"; {len(failed)} frames failed"
+        for key, reason in itertools.islice(failed.items(), _MAX_LISTED):
+            text += f"\nfailed {key}: {reason}"
+    entry.echo_result(as_json, {**count, "failed": failed, "out": str(out)}, text)
+    if failed:
+        raise SystemExit(entry.FAILED)
 
 
 @click.command(cls=entry.Command)

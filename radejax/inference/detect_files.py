@@ -9,14 +9,15 @@ from __future__ import annotations
 import csv
 import dataclasses
 import itertools
-import json
 import pathlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
+import jax
 import numpy as np
 
+from radejax import models
 from radejax.core import files
-from radejax.core.errors import UserError
+from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike
 from radejax.core.structures import Boxes
 from radejax.data.cameras import camera_inputs, require_images
@@ -27,7 +28,7 @@ from radejax.data.kradar.radar_files import find_frames, key_of, sequence_folder
 from radejax.data.pipeline import frame_histories
 from radejax.evaluation import kitti
 from radejax.geometry.camera import Camera
-from radejax.inference.detector import Detector
+from radejax.inference.detector import Detector, Item
 from radejax.inference.inputs import Frames
 from radejax.inference.predict import detect_batches
 
@@ -94,11 +95,16 @@ def front_images(
 def _views(frames: FrameSequence, detector: Detector) -> list[View]:
     """Return image file and camera of every frame, `NO_VIEW` unless it has both.
 
+    The list is empty for a radar-only model.
+
     Raises:
         UserError: There are images, and no calibration for any of them.
     """
+    model = detector.model
+    if not models.has_camera(model):
+        return []
     options = detector.camera_options.replace(allow_missing=True)
-    inputs = camera_inputs(frames, detector.model.options.image.size, options)
+    inputs = camera_inputs(frames, model.options.image.size, options)
     if any(frame.camera_path is not None for frame in frames):
         require_images(frames, inputs, "dataset")
     return [
@@ -137,7 +143,7 @@ class FrameInputs:
             for start, end in itertools.pairwise([*starts, len(self.keys)])
         ]
 
-    def item(self, batch: range) -> object:
+    def item(self, batch: range) -> Item:
         """Read the frames of a batch as an item of `Detector.stream`."""
         rows = slice(batch.start, batch.stop)
         if not self.views:
@@ -196,8 +202,7 @@ def find_inputs(
     def read(rows: slice) -> np.ndarray:
         return np.stack([f.read_projection(frames.grid) for f in frames[rows]])
 
-    views = _views(frames, detector) if detector.takes_camera else []
-    return FrameInputs([frame.key for frame in frames], read, views)
+    return FrameInputs([f.key for f in frames], read, _views(frames, detector))
 
 
 def _of_files(
@@ -231,8 +236,11 @@ def detect_files(
     *,
     batch_size: int = 8,
     file_format: str = "json",
-) -> dict[str, int]:
+) -> tuple[dict[str, int], dict[str, str]]:
     """Detect the objects in every frame, and write one file per frame atomically.
+
+    A frame with a box that is not finite fails, and a file of an earlier detection in it is
+    removed.
 
     Args:
         detector: Detector, whose default thresholds and region are used.
@@ -247,7 +255,8 @@ def detect_files(
             the records.
 
     Returns:
-        The numbers of "frames", of "boxes" and of "clipped" boxes, whose size was clipped.
+        The numbers of "frames" that did not fail, of "boxes" and of "clipped" boxes, whose
+        size was clipped; and the reasons of failed frames by key.
         For a model of several frames, "repeated" is the number of frames that repeat
         themselves, as there is no preceding one. For a radar-camera model, "radar_only" is
         the number of frames without a label file, image or calibration.
@@ -259,44 +268,48 @@ def detect_files(
     keys = inputs.keys
     out = files.as_path(out)
     out.mkdir(parents=True, exist_ok=True)
+    names = [f"{key.replace('/', '_')}.json" for key in keys]
     if file_format == "kitti":
+        names = [f"preds/{frame:06d}.txt" for frame in range(len(keys))]
         table = {"frame": list(range(len(keys))), "name": keys}
         files.write_json(out / "frames.json", table)
     parts = inputs.batches(detector.num_frames, batch_size)
     batches = (((np.array(rows), inputs.item(rows)) for rows in part) for part in parts)
-    found: list[Boxes] = []
-    count = {"frames": len(keys), "boxes": 0, "clipped": 0}
-    for frames, boxes in detect_batches(detector, batches, len(keys), progress=True):
-        count["boxes"] += len(boxes)
-        count["clipped"] += int(boxes.is_clipped.sum())
-        if file_format == "csv":
-            found.append(boxes)
-            continue
-        for name, text in _texts(boxes, frames, keys, file_format):
-            files.write_text(out / name, text)
+    found = [Boxes.one_frame([], [], [])]
+    failed = dict[str, str]()
+    count = {"frames": 0, "boxes": 0, "clipped": 0}
+    results = detect_batches(detector, batches, len(keys), progress=True)
+    for frames, detections in results:
+        on_host = jax.device_get(detections)
+        for row, frame in enumerate(frames.tolist()):
+            key = keys[frame]
+            path = out / names[frame]
+            one = jax.tree.map(lambda x, row=row: x[row : row + 1], on_host)
+            try:
+                boxes = one.to_boxes(frames[row : row + 1])
+            except DataError as error:
+                failed[key] = str(error)
+                if file_format != "csv":
+                    path.unlink(missing_ok=True)
+                continue
+            count["frames"] += 1
+            count["boxes"] += len(boxes)
+            count["clipped"] += int(boxes.is_clipped.sum())
+            if file_format == "csv":
+                found.append(boxes)
+            elif file_format == "kitti":
+                (text,) = kitti.prediction_texts(boxes, [frame])
+                files.write_text(path, f"{text}\n")
+            else:
+                rows = [{"frame": key, **box} for box in boxes.to_list()]
+                files.write_json(path, rows)
     if file_format == "csv":
         _write_csv(out / "boxes.csv", Boxes.concatenate(found), keys)
     if detector.num_frames > 1:
         count["repeated"] = len(parts)
     if detector.takes_camera:
         count["radar_only"] = detector.num_radar_only
-    return count
-
-
-def _texts(
-    boxes: Boxes, frames: list[int], keys: Sequence[str], file_format: str
-) -> Iterator[tuple[str, str]]:
-    """Yield name and text of the file of every frame of a batch."""
-    if file_format == "kitti":
-        texts = kitti.prediction_texts(boxes, frames)
-        for frame, text in zip(frames, texts, strict=True):
-            yield f"preds/{frame:06d}.txt", f"{text}\n"
-        return
-    for frame in frames:
-        key = keys[frame]
-        of_frame = boxes.take(boxes.frame == frame)
-        rows = [{"frame": key, **box} for box in of_frame.to_list()]
-        yield f"{key.replace('/', '_')}.json", json.dumps(rows, indent=2) + "\n"
+    return count, failed
 
 
 def _write_csv(path: pathlib.Path, boxes: Boxes, keys: Sequence[str]) -> None:

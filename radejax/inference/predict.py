@@ -5,7 +5,6 @@ from __future__ import annotations
 import collections
 import itertools
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any
 
 import jax
 import numpy as np
@@ -13,20 +12,20 @@ import tqdm
 from jaxtyping import Int
 
 from radejax.core.devices import Stopped, is_main
-from radejax.core.structures import Array, Boxes
+from radejax.core.structures import Array, Batch, Boxes, Detections
 from radejax.data.cameras import CameraInputs
 from radejax.data.dataset import FrameSequence
 from radejax.data.pipeline import LoaderOptions, make_loader, make_table
 from radejax.data.records import Records
-from radejax.inference.detector import Detector
+from radejax.inference.detector import Detector, Item
 
-Batches = Iterable[tuple[Int[Array, " B"], Any]]
+Batches = Iterable[tuple[Int[Array, " B"], Item]]
 """Indices of the frames of batches (-1 for padding), and items of `Detector.stream`."""
 
 
 def detect_batches(
     detector: Detector, parts: Iterable[Batches], num_frames: int, *, progress: bool
-) -> Iterator[tuple[list[int], Boxes]]:
+) -> Iterator[tuple[Int[np.ndarray, " B"], Detections]]:
     """Detect the objects in batches of frames, of which two are in flight.
 
     Args:
@@ -37,11 +36,11 @@ def detect_batches(
         progress: Show a progress bar.
 
     Yields:
-        Indices of the frames of a batch, without padding, and the boxes of these frames.
+        Indices of the frames of a batch (-1 for padding), and their detections.
     """
     started = collections.deque[Array]()
 
-    def items(part: Batches) -> Iterator[Any]:
+    def items(part: Batches) -> Iterator[Item]:
         for frame, item in part:
             started.append(frame)
             yield item
@@ -51,9 +50,8 @@ def detect_batches(
     with bar:
         for found in itertools.chain.from_iterable(streams):
             frame = np.asarray(started.popleft())
-            frames = frame[frame >= 0].tolist()
-            yield frames, found.to_boxes(frame)
-            bar.update(len(frames))
+            yield frame, found
+            bar.update(np.count_nonzero(frame >= 0))
 
 
 def predict_dataset(
@@ -98,7 +96,7 @@ def predict_dataset(
         images=images,
         num_frames=detector.num_frames,
     )
-    devices: set[Any] = detector.sharding.device_set
+    devices: set[jax.Device] = detector.sharding.device_set
     num_processes = len({device.process_index for device in devices})
     rows = -(-batch_size // len(devices)) * len(devices) // num_processes
     options = LoaderOptions(
@@ -113,7 +111,7 @@ def predict_dataset(
     detector = detector.replace(batch_sizes=(rows,))
     gather = jax.jit(lambda x: x, out_shardings=detector.replicated)
 
-    def batches() -> Iterator[tuple[jax.Array, Any]]:
+    def batches() -> Iterator[tuple[jax.Array, Batch]]:
         for batch in make_loader(table, options):
             if should_stop is not None and should_stop():
                 raise Stopped
@@ -121,4 +119,4 @@ def predict_dataset(
 
     progress = progress and is_main()
     parts = detect_batches(detector, [batches()], len(frames), progress=progress)
-    return Boxes.concatenate([boxes for _, boxes in parts])
+    return Boxes.concatenate([found.to_boxes(frame) for frame, found in parts])

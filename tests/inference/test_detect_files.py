@@ -16,6 +16,7 @@ from radejax.data.options import CameraOptions
 from radejax.evaluation.files import Source
 from radejax.evaluation.files import load as load_tables
 from radejax.inference.detect_files import detect_files, find_inputs, front_images
+from radejax.inference.detector import Detector
 from radejax.models.options import DinoRadeOptions, ImageOptions
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
@@ -40,12 +41,13 @@ def test_every_format_has_the_same_boxes(tmp_path):
     expected = detector(frames).to_list()
     for file_format in ("json", "kitti", "csv"):
         out = tmp_path / file_format
-        count = detect_files(
+        count, failed = detect_files(
             detector, inputs, out, batch_size=2, file_format=file_format
         )
         clipped = int(detector(frames).to_boxes().is_clipped.sum())
         num_boxes = sum(map(len, expected))
         assert count == {"frames": 3, "boxes": num_boxes, "clipped": clipped}
+        assert failed == {}
     rows = [
         {"frame": key, **box}
         for key, boxes in zip(keys, expected, strict=True)
@@ -79,6 +81,37 @@ def test_every_format_has_the_same_boxes(tmp_path):
         np.testing.assert_array_equal(getattr(found, name), getattr(kitti, name))
 
 
+@pytest.mark.parametrize("file_format", ["json", "kitti", "csv"])
+def test_a_frame_with_a_box_that_is_not_finite_fails(
+    tmp_path, monkeypatch, file_format
+):
+    detector = small.detector(score_threshold=0.0)
+    keys = [f"7/0000{i}" for i in range(3)]
+    _write_projections(tmp_path / "data", keys, small.projections(3))
+    inputs = find_inputs(detector, [tmp_path / "data"])
+    out = tmp_path / "out"
+    assert detect_files(detector, inputs, out, file_format=file_format)[1] == {}
+    earlier = sorted(out.rglob("*"))
+
+    def stream(self, frames):
+        for item in frames:
+            found = self(*item) if isinstance(item, tuple) else self(item)
+            yield found.replace(boxes=found.boxes.at[1, 2, 3].set(np.nan))
+
+    monkeypatch.setattr(Detector, "stream", stream)
+    count, failed = detect_files(detector, inputs, out, file_format=file_format)
+    assert count["frames"] == 2
+    assert list(failed) == ["7/00001"]
+    assert "row 2: l of the box is nan" in failed["7/00001"]
+    left = set(earlier) - set(out.rglob("*"))
+    names = {"json": ["7_00001.json"], "kitti": ["000001.txt"], "csv": []}
+    assert [path.name for path in left] == names[file_format]
+    if file_format == "csv":
+        with open(out / "boxes.csv", encoding="utf-8") as file:
+            found = {row["frame"] for row in csv.DictReader(file)}
+        assert found == {"7/00000", "7/00002"}
+
+
 def test_preceding_frames_of_files_are_of_their_sequence(tmp_path):
     """Frames 7, 8 and 10 of a sequence, and 11 of the next one."""
     detector = small.detector(num_frames=2, batch_sizes=(2,))
@@ -90,7 +123,7 @@ def test_preceding_frames_of_files_are_of_their_sequence(tmp_path):
     expected = detector(np.stack([frames[[0, 0, 2, 3]], frames], 1)).to_list()
     for batch_size in (1, 2, 8):
         out = tmp_path / f"out{batch_size}"
-        count = detect_files(detector, inputs, out, batch_size=batch_size)
+        count, _ = detect_files(detector, inputs, out, batch_size=batch_size)
         assert (count["frames"], count["repeated"]) == (4, 3)
         for path, boxes in zip(sorted(out.iterdir()), expected, strict=True):
             scores = [box["score"] for box in json.loads(path.read_text())]

@@ -138,7 +138,7 @@ def test_a_run_of_two_frames(
     assert len(list((tmp_path / "data" / "records").glob("*/*.npy"))) == 9
     root, out = tmp_path / "data", tmp_path / "boxes"
     detector = Detector.from_workdir(folder, score_threshold=0.0)
-    count = detect_files(detector, find_inputs(detector, [root]), out)
+    count, _ = detect_files(detector, find_inputs(detector, [root]), out)
     assert (count["frames"], count["repeated"]) == (9, 3)
     one = config.replace(data={"num_frames": 1})
     with pytest.raises(UserError, match=r"run do not fit config.model .*stem/doppler"):
