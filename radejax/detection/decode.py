@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pydantic
 from flax import struct
-from jaxtyping import Bool, Float, Num, Real
+from jaxtyping import Bool, Float, Int, Num, Real, Shaped
 
 from radejax.core.errors import require
 from radejax.core.options import AtLeastOne, Fraction, Options
@@ -61,7 +61,7 @@ class DecodeOptions(Options, section="config.decode"):
 ROI_LIMITS = "six numbers x0 < x1, y0 < y1, z0 < z1"
 
 
-def is_roi(roi: Any) -> bool:
+def is_roi(roi: object) -> bool:
     """Returns whether values are the `ROI_LIMITS` of a region, which may be infinite.
 
     Examples:
@@ -256,8 +256,12 @@ def find_peaks(
     )
 
 
-_rows_at = jax.vmap(lambda rows, indices: rows[indices])
-"""Rows of every frame: `[B, N, ...]` at `[B, K]` -> `[B, K, ...]`."""
+@jax.vmap
+def _rows_at(
+    rows: Shaped[jax.Array, "N ..."], indices: Int[jax.Array, " K"]
+) -> Shaped[jax.Array, "K ..."]:
+    """Returns rows of every frame: `[B, N, ...]` at `[B, K]` -> `[B, K, ...]`."""
+    return rows[indices]
 
 
 def _max_3x3(values: Float[jax.Array, "B R A C"]) -> Float[jax.Array, "B R A C"]:

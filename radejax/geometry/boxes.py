@@ -7,47 +7,50 @@ regress it. Functions return NumPy arrays for NumPy input and JAX arrays otherwi
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+import types
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Real
 
-ArrayT = TypeVar("ArrayT", bound=np.ndarray | jax.Array)
+ArrayT = TypeVar("ArrayT", np.ndarray, jax.Array)
 """An array type, NumPy's or JAX's, that is the same for input and output."""
+
+Number = float | np.number
 
 # Signs of the half extents at the corners, counter-clockwise from front left.
 _SIGN_LENGTH = (1.0, -1.0, -1.0, 1.0)
 _SIGN_WIDTH = (1.0, 1.0, -1.0, -1.0)
 
 
-def array_module(*values: Any) -> Any:
+def array_module(*values: object) -> types.ModuleType:
     """Returns numpy if every value is a NumPy or Python object, otherwise jax.numpy.
 
     Examples:
         >>> array_module(np.ones(3), 2.0) is np, array_module(jnp.ones(3)) is jnp
         (True, True)
     """
-    host_types: Any = np.ndarray | np.generic | float | int | list | tuple
+    host_types = (np.ndarray, np.generic, float, int, list, tuple)
     return np if all(isinstance(v, host_types) for v in values) else jnp
 
 
-def as_floats(*values: Any) -> tuple[Any, ...]:
-    """Returns the array module followed by the values as floating-point arrays.
+def as_floats(*values: Number | ArrayT) -> tuple[types.ModuleType, list[ArrayT]]:
+    """Returns the array module and the values as floating-point arrays.
 
     NumPy arrays are float64; JAX arrays have a common type of at least float32.
 
     Examples:
-        >>> as_floats(1)[1].dtype, as_floats(jnp.ones(3, jnp.bfloat16))[1].dtype
+        >>> as_floats(1)[1][0].dtype, as_floats(jnp.ones(3, jnp.bfloat16))[1][0].dtype
         (dtype('float64'), dtype('float32'))
     """
     xp = array_module(*values)
     if xp is np:
-        return (np, *(np.asarray(v, np.float64) for v in values))
-    arrays = [jnp.asarray(v) for v in values]
-    dtype = jnp.promote_types(jnp.result_type(*arrays), jnp.float32)
-    return (xp, *(v.astype(dtype) for v in arrays))
+        return xp, [xp.asarray(v, np.float64) for v in values]
+    arrays = [xp.asarray(v) for v in values]
+    dtype = xp.promote_types(xp.result_type(*arrays), np.float32)
+    return xp, [v.astype(dtype) for v in arrays]
 
 
 def boxes8_from_7(boxes: Real[ArrayT, "*batch 7"]) -> Float[ArrayT, "*batch 8"]:
@@ -69,7 +72,8 @@ def boxes8_from_7(boxes: Real[ArrayT, "*batch 7"]) -> Float[ArrayT, "*batch 8"]:
     xp = array_module(boxes)
     boxes = _checked(xp.asarray(boxes), 7)
     yaw = boxes[..., 6:7]
-    return xp.concatenate([boxes[..., :6], xp.sin(yaw), xp.cos(yaw)], -1)
+    converted: ArrayT = xp.concatenate([boxes[..., :6], xp.sin(yaw), xp.cos(yaw)], -1)
+    return converted
 
 
 def boxes7_from_8(boxes: Real[ArrayT, "*batch 8"]) -> Float[ArrayT, "*batch 7"]:
@@ -93,7 +97,8 @@ def boxes7_from_8(boxes: Real[ArrayT, "*batch 8"]) -> Float[ArrayT, "*batch 7"]:
     xp = array_module(boxes)
     boxes = _checked(xp.asarray(boxes), 8)
     yaw = xp.arctan2(boxes[..., 6:7], boxes[..., 7:8])
-    return xp.concatenate([boxes[..., :6], yaw], -1)
+    converted: ArrayT = xp.concatenate([boxes[..., :6], yaw], -1)
+    return converted
 
 
 def bev_corners(boxes: Real[ArrayT, "*batch _"]) -> Float[ArrayT, "*batch 4 2"]:
@@ -118,15 +123,17 @@ def bev_corners(boxes: Real[ArrayT, "*batch _"]) -> Float[ArrayT, "*batch 4 2"]:
     """
     xp = array_module(boxes)
     boxes = xp.asarray(boxes)
-    if boxes.shape[-1] == 8:
-        boxes = boxes7_from_8(boxes)
-    boxes = _checked(boxes, 7)
+    boxes = boxes7_from_8(boxes) if boxes.shape[-1] == 8 else _checked(boxes, 7)
     sin, cos = xp.sin(boxes[..., 6, None]), xp.cos(boxes[..., 6, None])
-    ahead = boxes[..., 3, None] / 2 * _row(xp, _SIGN_LENGTH, boxes)  # [..., 4]
-    left = boxes[..., 4, None] / 2 * _row(xp, _SIGN_WIDTH, boxes)
+    shape = (1,) * (boxes.ndim - 1) + (4,)
+    along = xp.asarray(_SIGN_LENGTH, boxes.dtype).reshape(shape)
+    across = xp.asarray(_SIGN_WIDTH, boxes.dtype).reshape(shape)
+    ahead = boxes[..., 3, None] / 2 * along  # [..., 4]
+    left = boxes[..., 4, None] / 2 * across
     x = boxes[..., 0, None] + cos * ahead - sin * left
     y = boxes[..., 1, None] + sin * ahead + cos * left
-    return xp.stack([x, y], -1)
+    ends: ArrayT = xp.stack([x, y], -1)
+    return ends
 
 
 def corners(boxes: Real[ArrayT, "*batch _"]) -> Float[ArrayT, "*batch 8 3"]:
@@ -147,19 +154,15 @@ def corners(boxes: Real[ArrayT, "*batch _"]) -> Float[ArrayT, "*batch 8 3"]:
     xp = array_module(boxes)
     boxes = xp.asarray(boxes)
     ground = bev_corners(boxes)  # [..., 4, 2]
-    z, half = boxes[..., 2, None, None], boxes[..., 5, None, None] / 2
-    level = xp.zeros_like(ground[..., :1])
-    bottom = xp.concatenate([ground, level + z - half], -1)
-    top = xp.concatenate([ground, level + z + half], -1)
-    return xp.concatenate([bottom, top], -2)
+    center = xp.zeros_like(ground[..., :1]) + boxes[..., 2, None, None]
+    half = boxes[..., 5, None, None] / 2
+    bottom = xp.concatenate([ground, center - half], -1)
+    top = xp.concatenate([ground, center + half], -1)
+    ends: ArrayT = xp.concatenate([bottom, top], -2)
+    return ends
 
 
-def _row(xp: Any, values: tuple[float, ...], like: Any) -> Any:
-    """Returns `values` along the last axis of an array with the rank and dtype of `like`."""
-    return xp.asarray(values, like.dtype).reshape((1,) * (like.ndim - 1) + (-1,))
-
-
-def _checked(boxes: Any, width: int) -> Any:
+def _checked(boxes: ArrayT, width: int) -> ArrayT:
     if boxes.ndim < 1 or boxes.shape[-1] != width:
         raise ValueError(f"boxes must be [..., {width}], got shape {boxes.shape}")
     return boxes

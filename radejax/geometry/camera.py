@@ -25,11 +25,13 @@ from jaxtyping import Bool, Float, Real
 
 from radejax.core.errors import DataError, require
 from radejax.core.files import as_path
-from radejax.geometry.boxes import array_module, corners
+from radejax.core.structures import Array
+from radejax.geometry.boxes import ArrayT, array_module, corners
 from radejax.geometry.radar_grid import ArrayValues
 
 Pixels = Real[np.ndarray, "*points 2"]
 Depths = Real[np.ndarray, "*points"]
+IsInImage = Bool[np.ndarray, "*points"] | np.bool_  # the latter for a single point
 ImageKind = Literal["raw", "pinhole"]
 """The recorded image with lens distortion, or a pinhole image with the same intrinsics."""
 
@@ -81,19 +83,18 @@ class Camera(struct.PyTreeNode):
         is_valid: `[...]` bool, False where the frame has no usable image.
     """
 
-    # The leaves have type Any because JAX also builds this tree with shapes, partition
-    # specs or None in place of arrays.
-    cam_from_ego: Any
-    intrinsics: Any
-    distortion: Any
-    max_radius: Any
-    size_px: Any
-    is_valid: Any
+    # Leaves are not validated: JAX also rebuilds the tree with shapes, specs or None.
+    cam_from_ego: Array
+    intrinsics: Array
+    distortion: Array
+    max_radius: Array
+    size_px: Array
+    is_valid: Array
 
 
 def project(
-    points_ego: Real[Any, "*points 3"], camera: Camera, *, depth_offset_m: float = 0.0
-) -> tuple[Float[Any, "*points 2"], Float[Any, "*points"]]:
+    points_ego: Real[ArrayT, "*points 3"], camera: Camera, depth_offset_m: float = 0.0
+) -> tuple[Float[ArrayT, "*points 2"], Float[ArrayT, "*points"]]:
     """Projects points of the ego frame into the image.
 
     With `(x, y, z) = cam_from_ego (p, 1)` and `(x', y') = d(x/z, y/z)`, the pixel is
@@ -121,8 +122,7 @@ def project(
         >>> pixels.tolist(), float(depth)
         ([340.0, 240.0], 5.0)
     """
-    batch = np.shape(camera.max_radius)
-    chex.assert_shape(points_ego, (*batch, ..., 3))
+    chex.assert_shape(points_ego, (*np.shape(camera.max_radius), ..., 3))
     points_cam = to_camera(points_ego, camera)
     return to_pixels(points_cam, camera, depth_offset_m), points_cam[..., 2]
 
@@ -136,16 +136,17 @@ def stack_cameras(cameras: Sequence[Camera]) -> Camera:
         (2, 3, 4)
     """
 
-    def stack(*leaves: Any) -> np.ndarray:
+    def stack(*leaves: Array) -> np.ndarray:
         stacked = np.stack(leaves)
         return stacked if stacked.dtype == bool else stacked.astype(np.float32)
 
-    return jax.tree.map(stack, *cameras)
+    batch: Camera = jax.tree.map(stack, *cameras)
+    return batch
 
 
 def to_camera(
-    points: Real[Any, "*points 3"], camera: Camera
-) -> Float[Any, "*points 3"]:
+    points: Real[ArrayT, "*points 3"], camera: Camera
+) -> Float[ArrayT, "*points 3"]:
     """Transforms points `[..., 3]` in meters from the ego frame to the camera frame.
 
     Examples:
@@ -155,18 +156,18 @@ def to_camera(
         [1.0, 0.0, 7.0]
     """
     xp = array_module(points, camera.cam_from_ego)
-    rotation, shift = camera.cam_from_ego[..., :3], camera.cam_from_ego[..., 3]
-    batch = shift.shape[:-1]
-    ones = (1,) * (points.ndim - shift.ndim)  # several points a camera
-    rotation = xp.reshape(rotation, batch + ones + (3, 3))
-    shift = xp.reshape(shift, batch + ones + (3,))
+    # Axes of several points of a camera come after those of a batch of cameras.
+    axes = tuple(range(camera.cam_from_ego.ndim - 2, points.ndim - 1))
+    transform = xp.expand_dims(camera.cam_from_ego, axes)
     # Accelerators may compute a matrix product in reduced precision, unlike this sum.
-    return xp.sum(rotation * points[..., None, :], -1) + shift
+    turned = xp.sum(transform[..., :3] * points[..., None, :], -1)
+    moved: ArrayT = turned + transform[..., 3]
+    return moved
 
 
 def to_pixels(
-    points_cam: Float[Any, "*points 3"], camera: Camera, depth_offset_m: float
-) -> Float[Any, "*points 2"]:
+    points_cam: Float[ArrayT, "*points 3"], camera: Camera, depth_offset_m: float
+) -> Float[ArrayT, "*points 2"]:
     """Projects points `[..., 3]` of the camera frame to pixels `[..., 2]`; see `project`.
 
     Examples:
@@ -178,23 +179,24 @@ def to_pixels(
     xp = array_module(points_cam, camera.intrinsics)
     depth = points_cam[..., 2] + depth_offset_m
     depth = xp.where(depth == 0, 1e-12, depth)
-    extra = depth.ndim - np.ndim(camera.max_radius)
-
-    def spread(value: Any) -> Any:  # batch axes of the camera to the front
-        return xp.reshape(value, np.shape(value) + (1,) * extra)
-
-    fx, fy, cx, cy = (spread(camera.intrinsics[..., i]) for i in range(4))
-    k1, k2, p1, p2, k3 = (spread(camera.distortion[..., i]) for i in range(5))
-    x, y = points_cam[..., 0] / depth, points_cam[..., 1] / depth
+    axes = tuple(range(np.ndim(camera.max_radius), depth.ndim))
+    focal = xp.expand_dims(camera.intrinsics, axes)
+    lens = xp.expand_dims(camera.distortion, axes)
+    fx, fy, cx, cy = (focal[..., i] for i in range(4))
+    k1, k2, p1, p2, k3 = (lens[..., i] for i in range(5))
+    x = points_cam[..., 0] / depth
+    y = points_cam[..., 1] / depth
     square = x * x + y * y
     radial = 1.0 + square * (k1 + square * (k2 + square * k3))
     x_seen = x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x)
     y_seen = y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y
     # Beyond `max_radius` the distortion polynomial would map points back into the image, so
     # they are moved far outside it.
-    folds = square > spread(camera.max_radius) ** 2
-    x_seen, y_seen = xp.where(folds, x * 1e3, x_seen), xp.where(folds, y * 1e3, y_seen)
-    return xp.stack([fx * x_seen + cx, fy * y_seen + cy], -1)
+    folds = square > xp.expand_dims(camera.max_radius, axes) ** 2
+    x_seen = xp.where(folds, x * 1e3, x_seen)
+    y_seen = xp.where(folds, y * 1e3, y_seen)
+    pixels: ArrayT = xp.stack([fx * x_seen + cx, fy * y_seen + cy], -1)
+    return pixels
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -268,7 +270,11 @@ class CameraCalibration(ArrayValues):
         )
 
     @classmethod
-    def from_kradar(cls, path: str | pathlib.Path, **fields: Any) -> CameraCalibration:
+    def from_kradar(
+        cls,
+        path: str | pathlib.Path,
+        radar_from_lidar_m: Sequence[float] = RADAR_FROM_LIDAR_M,
+    ) -> CameraCalibration:
         """Reads one of K-Radar's `cam_*.yml` files, of one sequence or of all.
 
         K-Radar's calibration tool writes angles relative to a camera that looks straight
@@ -277,7 +283,7 @@ class CameraCalibration(ArrayValues):
 
         Args:
             path: Path of the file, which has one `key: number` per line.
-            **fields: Values for the remaining attributes, e.g. `radar_from_lidar_m`.
+            radar_from_lidar_m: The attribute of the same name.
 
         Raises:
             FileNotFoundError: The file does not exist.
@@ -301,7 +307,7 @@ class CameraCalibration(ArrayValues):
                 translation_m=[values[key] for key in _SHIFTS],
                 width=int(values.get("img_size_w", 1280)),
                 height=int(values.get("img_size_h", 720)),
-                **fields,
+                radar_from_lidar_m=radar_from_lidar_m,
             )
         except ValueError as error:
             raise DataError(f"{path}: {error}") from None
@@ -340,8 +346,8 @@ class CameraCalibration(ArrayValues):
         range_m, azimuth_rad = np.meshgrid(
             np.arange(5.0, 61), np.deg2rad(_AZIMUTHS_DEG)
         )
-        x_m, y_m = range_m * np.cos(azimuth_rad), range_m * np.sin(azimuth_rad)
-        ahead = np.stack([x_m, y_m, np.zeros_like(x_m)], -1)
+        x_m = range_m * np.cos(azimuth_rad)
+        ahead = np.stack([x_m, range_m * np.sin(azimuth_rad), np.zeros_like(x_m)], -1)
         if not self.in_image(*self.project_ego(ahead)).any():
             raise DataError(
                 f"{source}: not the calibration of a front camera: nothing that is 5 to "
@@ -364,9 +370,9 @@ class CameraCalibration(ArrayValues):
             cam_from_ego=np.concatenate([self.rotation, shift[:, None]], 1),
             intrinsics=self.intrinsics,
             distortion=distortion,
-            max_radius=np.float64(_fold_radius(distortion)),
+            max_radius=np.array(_fold_radius(distortion)),
             size_px=np.array([self.width, self.height], np.float64),
-            is_valid=np.bool_(is_valid),
+            is_valid=np.array(is_valid),
         )
 
     def project_ego(
@@ -378,7 +384,7 @@ class CameraCalibration(ArrayValues):
         """
         return project(np.asarray(points_ego, np.float64), self.camera(image))
 
-    def in_image(self, pixels: Pixels, depth_m: Depths) -> Bool[Any, "*points"]:
+    def in_image(self, pixels: Pixels, depth_m: Depths) -> IsInImage:
         """Returns True where projected points lie in front of the camera and in the image."""
         inside = (pixels >= 0) & (pixels < np.array([self.width, self.height]))
         return inside.all(-1) & (depth_m > 0)
@@ -403,7 +409,7 @@ class CameraCalibration(ArrayValues):
         corners_cam = to_camera(corners(np.asarray(boxes, np.float64)), camera)
         ends = corners_cam[:, _BOX_EDGES]  # [N, 12, 2, 3]
         depth = ends[..., 2]
-        is_visible = (depth > near_m).any(-1)
+        is_visible = np.any(depth > near_m, axis=-1)
         # Ends behind the near plane move along their edge onto the plane.
         span = depth[..., ::-1] - depth
         safe = np.where(span == 0, 1.0, span)
@@ -430,7 +436,8 @@ def _rotation(axis: int, angle: float) -> Float[np.ndarray, "3 3"]:
     matrix = np.eye(3)
     i, j = (axis + 1) % 3, (axis + 2) % 3
     matrix[i, i] = matrix[j, j] = math.cos(angle)
-    matrix[j, i], matrix[i, j] = math.sin(angle), -math.sin(angle)
+    matrix[j, i] = math.sin(angle)
+    matrix[i, j] = -math.sin(angle)
     return matrix
 
 

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping
-from typing import Any, Literal, get_args
+from typing import Literal, TypeVar, get_args
 
 import chex
 import jax
@@ -18,14 +17,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Real
 
 from radejax.core.errors import require
-from radejax.geometry.boxes import array_module, as_floats
+from radejax.core.files import JsonObject
+from radejax.core.structures import Array
+from radejax.geometry.boxes import ArrayT, Number, array_module, as_floats
 
 _LEAST_BINS = {"range_m": 2, "azimuth_rad": 2, "elevation_rad": 0, "doppler_mps": 0}
 _MAX_VALUE = 10_000.0  # larger than any value on a radar's axes
 
 AzimuthMapping = Literal["true", "stretched"]
-Positions = float | Real[Any, "*#bins"]
-"""A number or an array; several positions broadcast against each other."""
+PositionT = TypeVar("PositionT", float, np.ndarray, jax.Array)
 
 
 class ArrayValues:
@@ -42,8 +42,7 @@ class ArrayValues:
         return value
 
     def _key(self) -> tuple[object, ...]:
-        fields: Any = dataclasses.fields(self)  # type: ignore[arg-type]
-        values = (getattr(self, field.name) for field in fields)
+        values = vars(self).values()
         return tuple(v.tobytes() if isinstance(v, np.ndarray) else v for v in values)
 
     def __eq__(self, other: object) -> bool:
@@ -72,7 +71,7 @@ def _is_uniform(content: bytes) -> bool:
     return bool(np.abs(axis - even).max() <= 1e-3 * abs(_step(axis)))
 
 
-def values_at(axis: Float[np.ndarray, " bins"], position: Positions) -> Any:
+def values_at(axis: Float[np.ndarray, " bins"], position: PositionT) -> PositionT:
     """Returns the values of an axis at fractional bins, which may be outside of it.
 
     They are linear between adjacent centers, and continue with the first and last step.
@@ -82,7 +81,8 @@ def values_at(axis: Float[np.ndarray, " bins"], position: Positions) -> Any:
         [0.0, 3.0, 6.0]
     """
     if is_uniform(axis):
-        return axis[0] + position * _step(axis)
+        values: PositionT = axis[0] + position * _step(axis)
+        return values
     return _interpolated(position, np.arange(axis.size), axis)
 
 
@@ -90,16 +90,18 @@ def _step(axis: Float[np.ndarray, " bins"]) -> float:
     return float((axis[-1] - axis[0]) / (axis.size - 1))
 
 
-def _interpolated(x: Any, xs: np.ndarray, ys: np.ndarray) -> Any:
+def _interpolated(x: PositionT, xs: np.ndarray, ys: np.ndarray) -> PositionT:
     """Evaluates the lines through adjacent points (xs, ys), where xs is monotonic."""
     xp = array_module(x)
     if xs[0] > xs[-1]:
-        xs, ys = xs[::-1], ys[::-1]
+        xs = xs[::-1]
+        ys = ys[::-1]
     left = xp.searchsorted(xp.asarray(xs), x, side="right") - 1
     left = xp.clip(left, 0, xs.size - 2)
     tables = xs, ys, np.diff(ys) / np.diff(xs)
     start, value, slope = (xp.asarray(table)[left] for table in tables)
-    return value + (x - start) * slope
+    interpolated: PositionT = value + (x - start) * slope
+    return interpolated
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -181,9 +183,8 @@ class RadarGrid(ArrayValues):
             fov_azimuth_rad=np.deg2rad(53.0),
         )
 
-    @classmethod
+    @staticmethod
     def reduced(
-        cls,
         *,
         num_doppler: int,
         num_range: int,
@@ -202,7 +203,7 @@ class RadarGrid(ArrayValues):
         azimuth = np.deg2rad(max_azimuth_deg)
         elevation = np.deg2rad(max_elevation_deg) if num_elevation > 1 else 0.0
         doppler = max_doppler_mps if num_doppler > 1 else 0.0
-        return cls(
+        return RadarGrid(
             range_m=np.linspace(0.0, max_range_m, num_range),
             azimuth_rad=np.linspace(-azimuth, azimuth, num_azimuth),
             elevation_rad=np.linspace(-elevation, elevation, num_elevation),
@@ -212,11 +213,11 @@ class RadarGrid(ArrayValues):
         )
 
     @classmethod
-    def from_dict(cls, fields: Mapping[str, Any]) -> RadarGrid:
+    def from_dict(cls, fields: JsonObject) -> RadarGrid:
         """Creates the grid that `to_dict` has written."""
         return cls(**{f.name: fields[f.name] for f in dataclasses.fields(cls)})
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Returns the fields as lists and floats, which JSON stores without rounding."""
         return {name: np.asarray(value).tolist() for name, value in vars(self).items()}
 
@@ -248,8 +249,8 @@ class RadarGrid(ArrayValues):
         else:
             even = is_uniform(self.range_m) and is_uniform(self.azimuth_rad)
             require(even, "azimuth_mapping", azimuth_mapping, "true for uneven axes")
-            first, last = self.azimuth_rad[0], self.azimuth_rad[-1]
             range_m = np.linspace(self.range_m[0], self.fov_range_m, num_range)
+            first, last = self.azimuth_rad[[0, -1]]
             azimuth = np.linspace(first, last, num_azimuth)
         return dataclasses.replace(self, range_m=range_m, azimuth_rad=azimuth)
 
@@ -274,8 +275,8 @@ class RadarGrid(ArrayValues):
     @property
     def shape_drea(self) -> tuple[int, int, int, int]:
         """Shape of a tesseract: Doppler, range, elevation, azimuth."""
-        doppler, elevation = max(self.num_doppler, 1), max(self.num_elevation, 1)
-        return doppler, self.num_range, elevation, self.num_azimuth
+        num_elevation = max(self.num_elevation, 1)
+        return max(self.num_doppler, 1), self.num_range, num_elevation, self.num_azimuth
 
     @property
     def projection_shape(self) -> tuple[int, int, int]:
@@ -295,17 +296,17 @@ class RadarGrid(ArrayValues):
     @property
     def range_widths_m(self) -> float | Float[np.ndarray, " R"]:
         """Width of all range bins, or of each if ranges are not uniform."""
-        if is_uniform(self.range_m):
-            return self.range_step_m
-        return np.gradient(self.range_m)
+        return (
+            self.range_step_m if is_uniform(self.range_m) else np.gradient(self.range_m)
+        )
 
     def without_doppler(self) -> RadarGrid:
         """Returns the grid without its Doppler axis."""
         return dataclasses.replace(self, doppler_mps=np.array([]))
 
     def measured_channels(
-        self, projection: Float[Any, "*bins DE"]
-    ) -> Float[Any, "*bins _"]:
+        self, projection: Float[ArrayT, "*bins DE"]
+    ) -> Float[ArrayT, "*bins _"]:
         """Returns the channels of a tesseract's projection that are not of an empty axis."""
         shape = self.shape_drea
         if self.projection_shape[2] == shape[0] + shape[2]:
@@ -315,8 +316,10 @@ class RadarGrid(ArrayValues):
     # Bins and meters -----------------------------------------------------------------
 
     def bin_to_ego(
-        self, range_bin: Positions, azimuth_bin: Positions
-    ) -> Float[Any, "*bins 2"]:
+        self,
+        range_bin: Number | Real[ArrayT, "*#bins"],
+        azimuth_bin: Number | Real[ArrayT, "*#bins"],
+    ) -> Float[ArrayT, "*bins 2"]:
         """Returns the positions of range-azimuth bins on the ground plane of the ego frame.
 
         Bin (i, j) lies at range r = r0 + i dr and azimuth a = a0 + j da on uniform axes,
@@ -330,19 +333,24 @@ class RadarGrid(ArrayValues):
             `[..., 2]` x (forward) and y (left) in meters; NumPy float64 for NumPy
             or Python input, else a JAX array.
         """
-        xp, range_bin, azimuth_bin = as_floats(range_bin, azimuth_bin)
+        xp, (range_bin, azimuth_bin) = as_floats(range_bin, azimuth_bin)
         range_m = values_at(self.range_m, range_bin)
         azimuth = values_at(self.azimuth_rad, azimuth_bin)
-        return xp.stack([range_m * xp.cos(azimuth), -range_m * xp.sin(azimuth)], -1)
+        y_m = -range_m * xp.sin(azimuth)
+        positions: ArrayT = xp.stack([range_m * xp.cos(azimuth), y_m], -1)
+        return positions
 
-    def ego_to_bin(self, x_m: Positions, y_m: Positions) -> Float[Any, "*bins 2"]:
+    def ego_to_bin(
+        self, x_m: Number | Real[ArrayT, "*#bins"], y_m: Number | Real[ArrayT, "*#bins"]
+    ) -> Float[ArrayT, "*bins 2"]:
         """Returns the fractional bins of ground positions, as the inverse of `bin_to_ego`.
 
         Returns:
             `[..., 2]` range and azimuth in bins, not clipped to the grid.
         """
-        xp, x_m, y_m = as_floats(x_m, y_m)
-        range_m, azimuth = xp.sqrt(x_m * x_m + y_m * y_m), -xp.arctan2(y_m, x_m)
+        xp, (x_m, y_m) = as_floats(x_m, y_m)
+        range_m = xp.sqrt(x_m * x_m + y_m * y_m)
+        azimuth = -xp.arctan2(y_m, x_m)
         # The order of operations decides in which direction exact half bins are rounded.
         # This order gives the bins of the released code. Azimuth is measured from the
         # middle of the axis, so that a point straight ahead lies exactly in the middle
@@ -359,9 +367,12 @@ class RadarGrid(ArrayValues):
         azimuth_bin = (azimuth - middle) * last / span + last / 2
         if not is_uniform(axis):
             azimuth_bin = _interpolated(azimuth, axis, np.arange(axis.size))
-        return xp.stack([range_bin, azimuth_bin], -1)
+        bins: ArrayT = xp.stack([range_bin, azimuth_bin], -1)
+        return bins
 
-    def nearest_bin(self, x_m: Positions, y_m: Positions) -> Int[Any, "*bins 2"]:
+    def nearest_bin(
+        self, x_m: Number | Real[ArrayT, "*#bins"], y_m: Number | Real[ArrayT, "*#bins"]
+    ) -> Int[ArrayT, "*bins 2"]:
         """Returns the integer bins nearest to ground positions, clipped to the grid.
 
         Halves are rounded to even, as in the released ground-truth encoding.
@@ -373,7 +384,8 @@ class RadarGrid(ArrayValues):
         xp = array_module(bins)
         last = xp.asarray([self.num_range - 1, self.num_azimuth - 1], bins.dtype)
         last = xp.broadcast_to(last, bins.shape)
-        return xp.clip(xp.round(bins), 0, last).astype(xp.int32)
+        nearest: ArrayT = xp.clip(xp.round(bins), 0, last).astype(xp.int32)
+        return nearest
 
     def bin_centers_ego(self) -> Float[np.ndarray, "R A 2"]:
         """Returns x and y of every range-azimuth bin center in meters, `[R, A, 2]` float64."""
@@ -413,7 +425,7 @@ class RadarGrid(ArrayValues):
         center = jnp.stack([range_m * cos, -range_m * sin, zeros], -1)
         return jnp.concatenate([center + params[..., :3], params[..., 3:]], -1)
 
-    def check_maps(self, heatmap: Any, box_params: Any) -> None:
+    def check_maps(self, heatmap: Array, box_params: Array) -> None:
         """Raises `ValueError` if the shapes of a detector's maps do not match the grid.
 
         Examples:
@@ -430,8 +442,12 @@ class RadarGrid(ArrayValues):
                 "pass the grid of the maps, padded if the model pads and does not crop"
             )
 
-    def in_field_of_view(self, x_m: Positions, y_m: Positions) -> Bool[Any, "*bins"]:
+    def in_field_of_view(
+        self, x_m: Real[ArrayT, "*#bins"], y_m: Real[ArrayT, "*#bins"]
+    ) -> Bool[ArrayT, "*bins"]:
         """Returns True for positions in front of the radar within its azimuth and range."""
-        xp, x_m, y_m = as_floats(x_m, y_m)
+        xp, (x_m, y_m) = as_floats(x_m, y_m)
         is_ahead = (xp.abs(xp.arctan2(y_m, x_m)) <= self.fov_azimuth_rad) & (x_m >= 0)
-        return is_ahead & (xp.sqrt(x_m * x_m + y_m * y_m) <= self.fov_range_m)
+        is_near = xp.sqrt(x_m * x_m + y_m * y_m) <= self.fov_range_m
+        is_inside: ArrayT = is_ahead & is_near
+        return is_inside

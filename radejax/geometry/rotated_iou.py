@@ -19,7 +19,7 @@ The same code runs on `jax.numpy` (float32, jit) and on NumPy (float64, for eval
 
 from __future__ import annotations
 
-from typing import Any
+import types
 
 import chex
 from jaxtyping import Float, Real
@@ -58,8 +58,10 @@ def bev_iou(
         0.3333
     """
     xp, a, b = _all_pairs(a, b)
-    ground_a, ground_b = _footprint(xp, a), _footprint(xp, b)
-    area_a, area_b = ground_a[2] * ground_a[3], ground_b[2] * ground_b[3]
+    ground_a = _footprint(xp, a)
+    ground_b = _footprint(xp, b)
+    area_a = ground_a[2] * ground_a[3]
+    area_b = ground_b[2] * ground_b[3]
     return _ratio(xp, _intersection(xp, ground_a, ground_b), area_a, area_b)
 
 
@@ -84,12 +86,14 @@ def iou_3d(
         0.3333
     """
     xp, a, b = _all_pairs(a, b)
-    ground_a, ground_b = _footprint(xp, a), _footprint(xp, b)
+    ground_a = _footprint(xp, a)
+    ground_b = _footprint(xp, b)
     area = _intersection(xp, ground_a, ground_b)
-    height_a, height_b = xp.maximum(a[..., 5], 0), xp.maximum(b[..., 5], 0)
+    height_a: ArrayT = xp.maximum(a[..., 5], 0)
+    height_b: ArrayT = xp.maximum(b[..., 5], 0)
     # The difference of top and bottom may round to more than either height.
     shared = xp.minimum(shared_height(a, b, z_center), xp.minimum(height_a, height_b))
-    volume = area * shared
+    volume: ArrayT = area * shared
     volume_a = ground_a[2] * ground_a[3] * height_a
     volume_b = ground_b[2] * ground_b[3] * height_b
     return _ratio(xp, volume, volume_a, volume_b)
@@ -110,7 +114,7 @@ def bev_intersection(
         >>> bev_intersection(car, car + [3, 0, 0, 0, 0, 0, 0]).round(6).tolist()
         [2.0]
     """
-    xp, a, b = as_floats(a, b)
+    xp, (a, b) = as_floats(a, b)
     return _intersection(xp, _footprint(xp, a), _footprint(xp, b))
 
 
@@ -129,18 +133,19 @@ def shared_height(
     above, below = 1 - z_center, z_center
     top = xp.minimum(a[..., 2] + above * a[..., 5], b[..., 2] + above * b[..., 5])
     bottom = xp.maximum(a[..., 2] - below * a[..., 5], b[..., 2] - below * b[..., 5])
-    return xp.maximum(top - bottom, 0)
+    height: ArrayT = xp.maximum(top - bottom, 0)
+    return height
 
 
-def _all_pairs(a: Any, b: Any) -> tuple[Any, Any, Any]:
+def _all_pairs(a: ArrayT, b: ArrayT) -> tuple[types.ModuleType, ArrayT, ArrayT]:
     """Returns the array module, `a` as `[..., N, 1, _]` and `b` as `[..., 1, M, _]`."""
-    xp, a, b = as_floats(a, b)
+    xp, (a, b) = as_floats(a, b)
     chex.assert_equal_rank([a, b])
     chex.assert_equal_shape_prefix([a, b], a.ndim - 2)
     return xp, a[..., :, None, :], b[..., None, :, :]
 
 
-def _footprint(xp: Any, boxes: Any) -> tuple[Any, ...]:
+def _footprint(xp: types.ModuleType, boxes: ArrayT) -> tuple[ArrayT, ...]:
     """Returns center x and y, non-negative length and width, sin and cos of the heading."""
     width = boxes.shape[-1] if boxes.ndim else 0
     if width not in (7, 8):
@@ -156,7 +161,9 @@ def _footprint(xp: Any, boxes: Any) -> tuple[Any, ...]:
     return x, y, xp.maximum(length * scale, 0), xp.maximum(breadth * scale, 0), sin, cos
 
 
-def _intersection(xp: Any, a: tuple[Any, ...], b: tuple[Any, ...]) -> Any:
+def _intersection(
+    xp: types.ModuleType, a: tuple[ArrayT, ...], b: tuple[ArrayT, ...]
+) -> ArrayT:
     """Computes the area common to two footprints, elementwise with broadcasting."""
     ax, ay, a_length, a_width, a_sin, a_cos = a
     bx, by, b_length, b_width, b_sin, b_cos = b
@@ -168,14 +175,17 @@ def _intersection(xp: Any, a: tuple[Any, ...], b: tuple[Any, ...]) -> Any:
     cos = a_cos * b_cos + a_sin * b_sin
     # An edge has a direction, a distance from the center of its box and a half length. The
     # directions differ by quarter turns, and the box lies to the left of each edge.
-    zero, one = xp.zeros_like(sin), xp.ones_like(sin)
+    zero = xp.zeros_like(sin)
+    one = xp.ones_like(sin)
     a_direction = [(one, zero), (zero, one), (-one, zero), (zero, -one)]
     b_direction = [(cos, sin), (-sin, cos), (-cos, -sin), (sin, -cos)]
     a_half = [(a_width / 2, a_length / 2), (a_length / 2, a_width / 2)] * 2
     b_half = [(b_width / 2, b_length / 2), (b_length / 2, b_width / 2)] * 2
 
-    a_low, a_high = [-h for _, h in a_half], [h for _, h in a_half]
-    b_low, b_high = [-h for _, h in b_half], [h for _, h in b_half]
+    a_low = [-h for _, h in a_half]
+    a_high = [h for _, h in a_half]
+    b_low = [-h for _, h in b_half]
+    b_high = [h for _, h in b_half]
     for i, (ux, uy) in enumerate(a_direction):
         for j, (vx, vy) in enumerate(b_direction):
             # From the middle of edge i of a to the middle of edge j of b.
@@ -206,10 +216,14 @@ def _intersection(xp: Any, a: tuple[Any, ...], b: tuple[Any, ...]) -> Any:
         inside = xp.maximum(b_high[j] - b_low[j], 0)
         twice_area = twice_area + inside * (b_half[j][0] + x * vy - y * vx)
     smaller = xp.minimum(a_length * a_width, b_length * b_width)
-    return xp.clip(twice_area / 2, 0, smaller)
+    area: ArrayT = xp.clip(twice_area / 2, 0, smaller)
+    return area
 
 
-def _ratio(xp: Any, shared: Any, size_a: Any, size_b: Any) -> Any:
+def _ratio(
+    xp: types.ModuleType, shared: ArrayT, size_a: ArrayT, size_b: ArrayT
+) -> ArrayT:
     """Computes intersection over union, 0 where both boxes are empty."""
     union = size_a + size_b - shared
-    return shared / xp.where(union > 0, union, 1)
+    ratio: ArrayT = shared / xp.where(union > 0, union, 1)
+    return ratio

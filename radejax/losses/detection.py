@@ -154,14 +154,15 @@ def detection_loss(
     # that have one.
     if options.assignment == "center":
         bins = grid.nearest_bin(boxes[..., 0], boxes[..., 1])  # [B, N, 2]
-        expected, is_matched = boxes, is_valid
+        expected = boxes
+        is_matched = is_valid
     else:
         bins, expected, is_matched = _after_nms(
             decoding or DecodeOptions(), maps, boxes, is_valid, grid
         )
     # A gather per frame needs no communication if the batch is sharded over devices.
-    gather = jax.vmap(lambda params, bins: params[bins[:, 0], bins[:, 1]])
-    predicted = grid.boxes_at(gather(maps.box_params, bins), bins)
+    params = jax.vmap(lambda map, at: map[at[:, 0], at[:, 1]])(maps.box_params, bins)
+    predicted = grid.boxes_at(params, bins)
     row = is_matched[..., None]
     pairs = Pairs(
         maps.heatmap_logits,
@@ -216,8 +217,8 @@ def _gwd(pairs: Pairs, options: LossOptions) -> Float[jax.Array, ""]:
     predicted = pairs.predicted
     if options.normalize_yaw:
         predicted = _with_unit_yaw(predicted)
-    tau, transform = options.gwd_tau, options.gwd_transform
-    return pairs.mean(gwd_loss(predicted, pairs.expected, tau, transform))
+    loss = gwd_loss(predicted, pairs.expected, options.gwd_tau, options.gwd_transform)
+    return pairs.mean(loss)
 
 
 def _smooth_l1(pairs: Pairs, _: LossOptions) -> Float[jax.Array, ""]:

@@ -95,7 +95,8 @@ def gaussian_heatmap(
     # The barrier prevents the compiler from fusing the sum separately into each of its
     # uses. Rounding then differs, and a sum near 1 counts as positive in one use but not
     # in another (jax 0.10.0 on CPUs).
-    return jax.lax.optimization_barrier(jnp.minimum(heatmap, 1.0))
+    target: jax.Array = jax.lax.optimization_barrier(jnp.minimum(heatmap, 1.0))
+    return target
 
 
 def focal_loss(logits: Maps, target: Maps) -> Float[jax.Array, ""]:
@@ -159,13 +160,15 @@ def _sigmas(
     """Returns the standard deviations along range and azimuth in bins, `[..., N]` each."""
     modes = get_args(SigmaMode)
     require(sigma_mode in modes, "sigma_mode", sigma_mode, f"one of {modes}")
-    length, width = boxes[..., 3], boxes[..., 4]
+    length = boxes[..., 3]
+    width = boxes[..., 4]
     if sigma_mode == "fixed":
         along_range = along_azimuth = jnp.full_like(length, sigma_bins)
     elif sigma_mode == "adaptive":
         along_range = along_azimuth = 0.3 * jnp.maximum(length, width)
     else:
-        along_range, along_azimuth = length / 6, width / 6
+        along_range = length / 6
+        along_azimuth = width / 6
     return jnp.maximum(along_range, _MIN_SIGMA), jnp.maximum(along_azimuth, _MIN_SIGMA)
 
 

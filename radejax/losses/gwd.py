@@ -77,7 +77,8 @@ def gwd(a: Boxes8, b: Boxes8) -> PerPair:
     if a.shape[-1:] != (8,) or b.shape[-1:] != (8,):
         raise ValueError(f"boxes must be [..., 8], got {a.shape} and {b.shape}")
     dtype = jnp.promote_types(jnp.result_type(a, b), jnp.float32)
-    a, b = a.astype(dtype), b.astype(dtype)
+    a = a.astype(dtype)
+    b = b.astype(dtype)
     offset = a[..., :2] - b[..., :2]
     return jnp.sum(offset * offset, -1) + _shape_distance(a, b)
 
@@ -122,7 +123,8 @@ def gwd_loss(
 
 def _root_entries(boxes: Boxes8) -> _Matrix:
     """Returns the entries xx, xy and yy of the symmetric matrix S."""
-    length, width = boxes[..., 3] / 2, boxes[..., 4] / 2
+    length = boxes[..., 3] / 2
+    width = boxes[..., 4] / 2
     sin, cos = boxes[..., 6], boxes[..., 7]
     return (
         length * cos * cos + width * sin * sin,
@@ -138,11 +140,16 @@ def _root_differences(a: Boxes8, b: Boxes8) -> _Matrix:
     If the entries themselves were subtracted, a compiler that fuses a product with the
     subtraction could round the two entries differently.
     """
-    sin_a, cos_a, sin_b, cos_b = a[..., 6], a[..., 7], b[..., 6], b[..., 7]
-    length, width = (a[..., 3] - b[..., 3]) / 2, (a[..., 4] - b[..., 4]) / 2
-    length_b, width_b = b[..., 3] / 2, b[..., 4] / 2
-    sin, cos = sin_a - sin_b, cos_a - cos_b
-    sin_square, cos_square = sin * (sin_a + sin_b), cos * (cos_a + cos_b)
+    sin_a, cos_a = a[..., 6], a[..., 7]
+    sin_b, cos_b = b[..., 6], b[..., 7]
+    length = (a[..., 3] - b[..., 3]) / 2
+    width = (a[..., 4] - b[..., 4]) / 2
+    length_b = b[..., 3] / 2
+    width_b = b[..., 4] / 2
+    sin = sin_a - sin_b
+    cos = cos_a - cos_b
+    sin_square = sin * (sin_a + sin_b)
+    cos_square = cos * (cos_a + cos_b)
     xx = length * cos_a**2 + width * sin_a**2
     yy = length * sin_a**2 + width * cos_a**2
     return (
@@ -155,11 +162,14 @@ def _root_differences(a: Boxes8, b: Boxes8) -> _Matrix:
 
 def _shape_distance(a: Boxes8, b: Boxes8) -> PerPair:
     """Computes tr(S1^2) + tr(S2^2) - 2 T without cancellation."""
-    (a_xx, a_xy, a_yy), (b_xx, b_xy, b_yy) = _root_entries(a), _root_entries(b)
+    a_xx, a_xy, a_yy = _root_entries(a)
+    b_xx, b_xy, b_yy = _root_entries(b)
     # P = S1 S2 and P P^T are written out because accelerators may compute a matrix product
     # in reduced precision.
-    p_xx, p_xy = a_xx * b_xx + a_xy * b_xy, a_xx * b_xy + a_xy * b_yy
-    p_yx, p_yy = a_xy * b_xx + a_yy * b_xy, a_xy * b_xy + a_yy * b_yy
+    p_xx = a_xx * b_xx + a_xy * b_xy
+    p_xy = a_xx * b_xy + a_xy * b_yy
+    p_yx = a_xy * b_xx + a_yy * b_xy
+    p_yy = a_xy * b_xy + a_yy * b_yy
     root = trace_of_root_2x2(
         p_xx * p_xx + p_xy * p_xy,
         p_xx * p_yx + p_xy * p_yy,
@@ -169,7 +179,8 @@ def _shape_distance(a: Boxes8, b: Boxes8) -> PerPair:
     gap = xx**2 + 2 * xy**2 + yy**2
     # P_xy - P_yx is computed from differences of entries, so it is 0 for equal boxes.
     skew = a_xy * (xx - yy) - (a_xx - a_yy) * xy
-    trace, det = p_xx + p_yy, p_xx * p_yy - p_xy * p_yx
+    trace = p_xx + p_yy
+    det = p_xx * p_yy - p_xy * p_yx
     # If tr P is not positive, which requires negative sizes, T - tr P has no cancellation.
     is_positive = trace > 0
     total = jnp.where(is_positive, root + trace, 1)
@@ -223,7 +234,8 @@ def _roots_and_axes(
     For a multiple of the identity, the rotation angle is 0.
     """
     angle = jnp.arctan2(2 * xy, xx - yy) / 2
-    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    cos = jnp.cos(angle)
+    sin = jnp.sin(angle)
     values = _diagonal_in_basis(xx, xy, yy, cos, sin)
     roots = [jnp.sqrt(jnp.maximum(v, _MIN_EIGENVALUE)) for v in values]
     return roots, cos, sin
