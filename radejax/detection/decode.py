@@ -144,8 +144,6 @@ def decode(
     """
     if score_threshold is None:
         score_threshold = options.score_threshold
-    if nms_iou is None:
-        nms_iou = options.nms_iou
     peaks = find_peaks(
         maps,
         grid,
@@ -159,7 +157,7 @@ def decode(
     peaks = dataclasses.replace(peaks, boxes=boxes)
     keep = suppress(
         peaks,
-        nms_iou,
+        options.nms_iou if nms_iou is None else nms_iou,
         per_class=options.per_class_nms,
         normalize_yaw=options.raw_yaw == "never",
     )
@@ -242,7 +240,6 @@ def find_peaks(
         best = jnp.where(_in_roi(maps.box_params, grid, roi), best, 0.0)
     best = best.reshape(best.shape[0], -1)  # [B, R * A]
     top, flat = jax.lax.top_k(best, min(max_peaks, best.shape[1]))
-    is_valid = top > 0
     classes = jnp.argmax(_rows_at(_flat_bins(scores), flat), -1)  # the first of equals
     params = _rows_at(_flat_bins(maps.box_params), flat).astype(jnp.float32)
     bins = jnp.stack([flat // num_azimuth, flat % num_azimuth], -1)
@@ -251,7 +248,7 @@ def find_peaks(
         boxes=grid.boxes_at(params, bins),
         scores=top,
         classes=classes.astype(jnp.int32),
-        is_valid=is_valid,
+        is_valid=top > 0,
         num_found=jnp.sum(best > 0, axis=-1, dtype=jnp.int32),
     )
 

@@ -8,7 +8,7 @@ References:
 from __future__ import annotations
 
 import functools
-from typing import Any, Literal
+from typing import Literal
 
 import flax.linen as nn
 import jax
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from radejax.models import layers
-from radejax.models.layers import ConvGNSiLU, Features, Map
+from radejax.models.layers import ConvGNSiLU, DoubleConvResidual, Features, Map
 
 CBAMKind = Literal["official", "paper", "off"]
 
@@ -147,12 +147,13 @@ class Backbone(layers.Part):
 
     @nn.compact
     def __call__(self, x: Features) -> Features:
-        wrap = nn.remat if self.remat else lambda module: module
-        shared: dict[str, Any] = {"num_groups": self.num_groups, "dtype": self.dtype}
-        block = functools.partial(wrap(layers.DoubleConvResidual), **shared)
+        double = nn.remat(DoubleConvResidual) if self.remat else DoubleConvResidual
+        block = functools.partial(double, num_groups=self.num_groups, dtype=self.dtype)
+        attend = nn.remat(CBAM) if self.remat else CBAM
+        cbam = functools.partial(attend, self.cbam, self.num_groups, dtype=self.dtype)
         if self.input_stem:
-            stem = InputStem(self.widths[0], self.doppler_bins, **shared, name="stem")
-            x = stem(x)
+            stem = functools.partial(InputStem, dtype=self.dtype, name="stem")
+            x = stem(self.widths[0], self.doppler_bins, self.num_groups)(x)
         else:
             x = layers.Conv(self.widths[0], dtype=self.dtype, name="start")(x)
         skips = []
@@ -167,7 +168,7 @@ class Backbone(layers.Part):
             skip = skips.pop()
             x = layers.Upsample(x.shape[-1], dtype=self.dtype, name=f"upsample_{i}")(x)
             if self.cbam != "off":
-                skip = wrap(CBAM)(self.cbam, **shared, name=f"cbam_{i}")(skip)
+                skip = cbam(name=f"cbam_{i}")(skip)
             x = block(width, name=f"decoder_{i}")(jnp.concatenate([x, skip], -1))
         return x
 

@@ -20,6 +20,7 @@ from jaxtyping import Float
 Inputs = Float[jax.Array, "B R A C"]
 Outputs = Float[jax.Array, "B R A F"]
 Kernel = Float[jax.Array, "k k C F"]
+Operands = tuple[jax.Array, jax.Array]  # input and kernel, or their gradients
 
 _DIMENSION_NUMBERS = ("NHWC", "HWIO", "NHWC")
 
@@ -84,16 +85,20 @@ def plain_conv2d(
     )
 
 
-def _forward(x: jax.Array, kernel: jax.Array, dilation: int) -> tuple:
+def _forward(
+    x: jax.Array, kernel: jax.Array, dilation: int
+) -> tuple[jax.Array, Operands]:
     return plain_conv2d(x, kernel, dilation), (x, kernel)
 
 
-def _backward(dilation: int, saved: tuple, grad: jax.Array) -> tuple:
+def _backward(dilation: int, saved: Operands, grad: jax.Array) -> Operands:
     x, kernel = saved
     (grad_x,) = jax.vjp(lambda x: plain_conv2d(x, kernel, dilation), x)[1](grad)
 
     def plain(x: Inputs, grad: Outputs) -> Kernel:
-        return jax.vjp(lambda k: plain_conv2d(x, k, dilation), kernel)[1](grad)[0]
+        pull = jax.vjp(lambda k: plain_conv2d(x, k, dilation), kernel)[1]
+        grad_kernel: jax.Array = pull(grad)[0]
+        return grad_kernel
 
     size, _, *channels = kernel.shape
     num_bins = x.shape[1] * x.shape[2]
@@ -137,7 +142,8 @@ def blocked_kernel_gradient(
     offsets = [dilation * tap for tap in range(size)]
 
     def add_block(total: jax.Array, i: jax.Array) -> tuple[jax.Array, None]:
-        image, start = i // num_blocks, i % num_blocks * rows
+        image = i // num_blocks
+        start = i % num_blocks * rows
         block = jax.lax.dynamic_slice(x, (image, start, 0, 0), (1, rows, a, c))[0]
         block = jnp.pad(block, ((0, 0), (padding, padding), (0, 0)))
         # Taps along azimuth shift the map; taps along range shift rows of the gradient.

@@ -20,17 +20,21 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import TypeVar
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Float, Int
 
-from radejax.models.layers import Layer
+from radejax.models.layers import Initializer, Layer
 
+T = TypeVar("T")
 Arrays = tuple[jax.Array, ...]
+HeadInputs = tuple[jax.Array, Arrays, Arrays]
+"""The arrays of `_lifted_head`, or their gradients: map, values per bin, biases."""
 Places = Float[jax.Array, "*places"]
 
 ChunkSizes = tuple[tuple[str, int], ...]  # platforms and bins, a hashable dictionary
@@ -55,8 +59,8 @@ class Linear(Layer):
     """
 
     features: int
-    kernel_init: Any = nn.initializers.xavier_uniform()
-    bias_init: Any = nn.initializers.zeros
+    kernel_init: Initializer = nn.initializers.xavier_uniform()
+    bias_init: Initializer = nn.initializers.zeros
     precision: str | None = None
 
     @nn.compact
@@ -65,8 +69,9 @@ class Linear(Layer):
     ) -> tuple[Float[jax.Array, "*batch C"], Float[jax.Array, " C"]]:
         kernel = self.param("kernel", self.kernel_init, (x.shape[-1], self.features))
         bias = self.param("bias", self.bias_init, (self.features,))
-        x, kernel = x.astype(self.dtype), kernel.astype(self.dtype)
-        return jnp.matmul(x, kernel, precision=self.precision), bias
+        x = x.astype(self.dtype)
+        y = jnp.matmul(x, kernel.astype(self.dtype), precision=self.precision)
+        return y, bias
 
 
 class DeformableAttention(Layer):
@@ -106,7 +111,8 @@ class DeformableAttention(Layer):
         Returns:
             `[B, N, C]` attention of the bins.
         """
-        heads, points = self.num_heads, self.num_points
+        heads = self.num_heads
+        points = self.num_points
         # Sampling locations need full precision, whatever the dtype of the features.
         place = functools.partial(
             Linear,
@@ -141,7 +147,9 @@ class DeformableAttention(Layer):
         total = query_weights.sum(-1, keepdims=True)  # 0 for bins without a query
         return out + (total * jnp.expand_dims(bias, (0, 1))).astype(self.dtype)
 
-    def _ring(self, _: jax.Array, shape: tuple, dtype: Any = jnp.float32) -> Any:
+    def _ring(
+        self, _: jax.Array, shape: tuple[int, ...], dtype: DTypeLike = jnp.float32
+    ) -> jax.Array:
         """Initializes the offsets: one direction per head, point i at i + 1 pixels."""
         angle = 2 * math.pi * np.arange(self.num_heads) / self.num_heads
         way = np.stack([np.cos(angle), np.sin(angle)], -1)
@@ -190,7 +198,8 @@ def lifted_attention(
     b = value.shape[0]  # symbolic in exports
     chunk_sizes = _chunk_sizes(chunk_size, b)
     value = jnp.moveaxis(value, 3, 1)  # [B, heads, H, W, D]
-    by_head = jnp.moveaxis(offsets, 2, 1), jnp.moveaxis(logits, 2, 1)
+    offsets = jnp.moveaxis(offsets, 2, 1)
+    logits = jnp.moveaxis(logits, 2, 1)
     # The geometry is either per sample or shared by the whole batch.
     reference = jnp.broadcast_to(reference, (b, *reference.shape[1:]))
     query_weights = jnp.broadcast_to(query_weights, (b, *query_weights.shape[1:]))
@@ -203,9 +212,11 @@ def lifted_attention(
             per_bin = (offsets, logits, *shared)
             return _lifted_head(chunk_sizes, value, per_bin, tuple(biases))
 
-        return jax.lax.map(head, (value, offsets, logits, offset_bias, logit_bias))
+        by_head = (value, offsets, logits, offset_bias, logit_bias)
+        attention: jax.Array = jax.lax.map(head, by_head)
+        return attention
 
-    arrays = (value, *by_head, scale, reference, query_weights)
+    arrays = (value, offsets, logits, scale, reference, query_weights)
     if b == 1:  # on a CPU, the gradient of a batch of one is slower
         return jnp.moveaxis(sample(*(x[0] for x in arrays)), 0, 1)[None]
     # This is not a loop over the samples: if the batch is split over devices, a loop would
@@ -213,14 +224,13 @@ def lifted_attention(
     return jnp.moveaxis(jax.vmap(sample)(*arrays), 1, 2)
 
 
-def _chunk_sizes(given: int, batch_size: Any) -> ChunkSizes:
+def _chunk_sizes(given: int, batch_size: object) -> ChunkSizes:
     """Returns the bins per chunk of each sample, by platform."""
     if given:
         return (("default", given),)
-    if not isinstance(batch_size, int):  # symbolic
-        batch_size = 1
+    count = batch_size if isinstance(batch_size, int) else 1  # 1 if it is symbolic
     return tuple(
-        (platform, max(least, bins // batch_size))
+        (platform, max(least, bins // count))
         for platform, (bins, least) in _CHUNK_SIZES.items()
     )
 
@@ -232,8 +242,8 @@ def _chunk_sizes(given: int, batch_size: Any) -> ChunkSizes:
 
 
 def _by_chunk(
-    function: Callable[..., Any], chunk_sizes: ChunkSizes, *arrays: Any
-) -> Any:
+    function: Callable[..., T], chunk_sizes: ChunkSizes, *arrays: jax.Array | Arrays
+) -> T:
     """Calls `function(chunk_size, *arrays)` with the chunk size of the platform.
 
     The platform is that for which the program is lowered, which may differ from the tracing
@@ -243,7 +253,8 @@ def _by_chunk(
     by_platform = {
         platform: functools.partial(function, size) for platform, size in chunk_sizes
     }
-    return jax.lax.platform_dependent(*arrays, **by_platform)
+    result: T = jax.lax.platform_dependent(*arrays, **by_platform)
+    return result
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
@@ -272,29 +283,32 @@ def _head_forward(
             preferred_element_type=wide_dtype(pixels.dtype),
         ).astype(pixels.dtype)
 
-    out = jax.lax.map(chunk, _to_chunks(per_bin, chunk_size))
+    out: jax.Array = jax.lax.map(chunk, _to_chunks(per_bin, chunk_size))
     return out.reshape(-1, out.shape[-1])[: len(per_bin[0])]
 
 
 def _lifted_head_forward(
-    chunk_sizes: ChunkSizes, *arrays: Any
-) -> tuple[jax.Array, Any]:
-    return _lifted_head(chunk_sizes, *arrays), arrays
+    chunk_sizes: ChunkSizes, value: jax.Array, per_bin: Arrays, biases: Arrays
+) -> tuple[jax.Array, HeadInputs]:
+    out = _lifted_head(chunk_sizes, value, per_bin, biases)
+    return out, (value, per_bin, biases)
 
 
 def _lifted_head_backward(
-    chunk_sizes: ChunkSizes, saved: Any, grad: jax.Array
-) -> tuple:
+    chunk_sizes: ChunkSizes, saved: HeadInputs, grad: jax.Array
+) -> HeadInputs:
     return _by_chunk(_head_backward, chunk_sizes, grad, *saved)
 
 
 def _head_backward(
     chunk_size: int, grad: jax.Array, value: jax.Array, per_bin: Arrays, biases: Arrays
-) -> tuple:
+) -> HeadInputs:
     pixels = value.reshape(-1, value.shape[-1])
     samples = functools.partial(_lifted_samples, value.shape[:2])
 
-    def chunk(sums: tuple, arrays: tuple) -> tuple[tuple, Arrays]:
+    def chunk(
+        sums: tuple[jax.Array, Arrays], arrays: tuple[Arrays, jax.Array]
+    ) -> tuple[tuple[jax.Array, Arrays], Arrays]:
         grad_pixels, grad_biases = sums
         parts, grad = arrays  # grad [n, D]
         share, pull, index = jax.vjp(samples, parts, biases, has_aux=True)
@@ -363,10 +377,12 @@ def _corners(
     """
     x_low, y_low = jnp.floor(x), jnp.floor(y)
     x_part, y_part = x - x_low, y - y_low
-    index, share = [], []
+    index = []
+    share = []
     for step_y in (0, 1):
         for step_x in (0, 1):
-            column, row = x_low + step_x, y_low + step_y
+            column = x_low + step_x
+            row = y_low + step_y
             is_inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
             part = (x_part if step_x else 1 - x_part) * (
                 y_part if step_y else 1 - y_part
@@ -379,7 +395,7 @@ def _corners(
     return jnp.stack(index, -1), jnp.stack(share, -1)
 
 
-def wide_dtype(dtype: Any) -> Any:
+def wide_dtype(dtype: DTypeLike) -> np.dtype:
     """Returns the dtype for sums and locations: float32 for half precision, else `dtype`."""
     return jnp.promote_types(dtype, jnp.float32)
 
@@ -393,7 +409,7 @@ def _rows(
     return rows.reshape(len(index), -1, pixels.shape[-1])
 
 
-def _to_chunks(arrays: Any, size: int) -> Any:
+def _to_chunks(arrays: T, size: int) -> T:
     """Splits `[N, ...]` into `[chunks, size, ...]`, padded with zeros.
 
     If N is less than `size`, there is one chunk of N.
@@ -405,4 +421,5 @@ def _to_chunks(arrays: Any, size: int) -> Any:
         padded = jnp.pad(x, [(0, -bins % size)] + [(0, 0)] * (x.ndim - 1))
         return padded.reshape(-1, size, *x.shape[1:])
 
-    return jax.tree.map(split, arrays)
+    chunks: T = jax.tree.map(split, arrays)
+    return chunks

@@ -40,7 +40,8 @@ class DinoRade(RadeNet):
 
     def setup(self) -> None:
         shared = self._shared()
-        dtype, width = shared["dtype"], self.options.decoder_width
+        dtype = shared["dtype"]
+        width = self.options.decoder_width
         image = self.options.image
         if image.kind == "vit":
             remat = shared["remat"] and not image.freeze

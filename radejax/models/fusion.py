@@ -7,6 +7,8 @@ References:
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -62,7 +64,9 @@ class Fusion(Part):
         options = self.options
         if options.necks:
             radar = self._neck("radar_neck")(radar)
-        dropout = nn.Dropout(options.dropout, deterministic=not train)
+        dropout: Callable[[Map], Map] = nn.Dropout(
+            options.dropout, deterministic=not train
+        )
         if camera is None or reference is None:
             return dropout(radar)
         if options.necks:
@@ -80,8 +84,8 @@ class Fusion(Part):
 
         counts = options.num_heads, options.num_points, options.chunk_size
         attention = DeformableAttention(c, *counts, dtype=self.dtype, name="attention")
-        points, means = per_bin(reference.points), per_bin(mean)
-        seen = attention(per_bin(radar), per_bin(scale), points, means, camera)
+        points = per_bin(reference.points)
+        seen = attention(per_bin(radar), per_bin(scale), points, per_bin(mean), camera)
         seen = seen.reshape(b, r, a, c)
         share = self._camera_share(radar, seen)
         has_camera = mean.sum(-1, keepdims=True) > 0  # bins with queries in the mean

@@ -64,7 +64,8 @@ class PlainNeck(Neck):
 
     @nn.compact
     def __call__(self, x: Map) -> Map:
-        block, width = nn.remat(ConvGNSiLU) if self.remat else ConvGNSiLU, x.shape[-1]
+        block = nn.remat(ConvGNSiLU) if self.remat else ConvGNSiLU
+        width = x.shape[-1]
         for i in (1, 2, 3):
             x = block(width, self.num_groups, dtype=self.dtype, name=f"block_{i}")(x)
         return x

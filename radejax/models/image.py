@@ -11,13 +11,13 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Any
+import functools
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Bool, Float, Real
 
 from radejax.models.convolution import product
@@ -48,10 +48,10 @@ def normalize(
     if jnp.issubdtype(image.dtype, jnp.floating):
         return image
     scaled = image.astype(jnp.float32) / 255.0
-    if not standardize:
-        return scaled
-    mean, std = _IMAGENET.reshape(2, 1, 1, 1, 3)
-    return (scaled - mean) / std
+    if standardize:
+        mean, std = _IMAGENET.reshape(2, 1, 1, 1, 3)
+        scaled = (scaled - mean) / std
+    return scaled
 
 
 # Kernel taps that contribute to even (row 0) and odd (row 1) outputs, in input order.
@@ -129,8 +129,8 @@ class CameraNeck(Layer):
                 statistics (collection "batch_stats").
         """
         x = Dense(self.features, dtype=self.dtype, name="proj")(tokens)
-        layers: dict[str, Any] = {"up_1": TransposedConv, "up_2": TransposedConv}
-        for name, layer in (layers | {"refine": Conv}).items():
+        for name in ("up_1", "up_2", "refine"):
+            layer = Conv if name == "refine" else TransposedConv
             x = layer(self.features, dtype=self.dtype, name=name)(x)
             norm = batch_norm(f"{name}_norm", self.dtype, train)
             x = nn.relu(norm(x, mask=counted_frames(has_image)))
@@ -146,7 +146,7 @@ def counted_frames(has_image: HasImage) -> Bool[jax.Array, "B 1 1 1"]:
     return (has_image | ~has_image.any())[:, None, None, None]
 
 
-def batch_norm(name: str, dtype: Any, train: bool) -> nn.BatchNorm:
+def batch_norm(name: str, dtype: DTypeLike, train: bool) -> nn.BatchNorm:
     """Returns batch normalization with torch's defaults (momentum 0.1, epsilon 1e-5).
 
     Unlike here, torch's running variance is unbiased. Over a camera map, the two variances
@@ -177,28 +177,40 @@ class FrozenBatchNorm(Layer):
 
     @nn.compact
     def __call__(self, x: Float[jax.Array, "B H W C"]) -> Float[jax.Array, "B H W C"]:
-        ones, zeros = nn.initializers.ones, nn.initializers.zeros
         shape = (x.shape[-1],)
-        scale, var = self.param("scale", ones, shape), self.param("var", ones, shape)
-        bias, mean = self.param("bias", zeros, shape), self.param("mean", zeros, shape)
+        scale = self.param("scale", nn.initializers.ones, shape)
+        var = self.param("var", nn.initializers.ones, shape)
+        bias = self.param("bias", nn.initializers.zeros, shape)
+        mean = self.param("mean", nn.initializers.zeros, shape)
         factor = scale * jax.lax.rsqrt(var + 1e-5)
         shift = jnp.expand_dims(bias - mean * factor, (0, 1, 2)).astype(self.dtype)
         return x * jnp.expand_dims(factor, (0, 1, 2)).astype(self.dtype) + shift
 
 
-def _conv(features: int, size: int, stride: int, dtype: Any, name: str) -> Conv:
+def _conv(features: int, size: int, stride: int, dtype: DTypeLike, name: str) -> Conv:
     return Conv(features, size, stride=stride, use_bias=False, dtype=dtype, name=name)
 
 
-def _normalized(
-    x: jax.Array, name: str, frozen: bool, dtype: Any, train: bool, mask: Mask = None
-) -> jax.Array:
-    if frozen:
-        return FrozenBatchNorm(dtype=dtype, name=name)(x)
-    return batch_norm(name, dtype, train)(x, mask=mask)
+class ResNetLayer(Layer, kw_only=True):
+    """Base class of the layers of a ResNet.
+
+    Attributes:
+        frozen: Whether to normalize with fixed statistics, as in a detector's trunk.
+            Otherwise there is batch normalization, which pretraining the trunk needs too.
+    """
+
+    frozen: bool = True
+
+    def _normalize(
+        self, x: jax.Array, name: str, train: bool, mask: Mask = None
+    ) -> jax.Array:
+        if self.frozen:
+            return FrozenBatchNorm(dtype=self.dtype, name=name)(x)
+        y: jax.Array = batch_norm(name, self.dtype, train)(x, mask=mask)
+        return y
 
 
-class Bottleneck(Layer):
+class Bottleneck(ResNetLayer):
     """Residual block of 1x1, 3x3 and 1x1 convolutions; the 3x3 convolution has the stride.
 
     If the numbers of channels differ, the shortcut has a 1x1 convolution.
@@ -206,21 +218,21 @@ class Bottleneck(Layer):
     Attributes:
         features: Channels of the first two convolutions; the output has four times as many.
         stride: Stride of the block.
-        frozen: Whether to normalize with fixed statistics instead of batch normalization.
         dtype: Dtype of the computation and the output.
     """
 
     features: int
     stride: int
-    frozen: bool
 
     @nn.compact
     def __call__(
         self, x: Float[jax.Array, "B H W C"], train: bool, mask: Mask = None
     ) -> Float[jax.Array, "B h w {4*self.features}"]:
-        def block(x: jax.Array, features: int, size: int, stride: int, name: str):
+        def block(
+            x: jax.Array, features: int, size: int, stride: int, name: str
+        ) -> jax.Array:
             x = _conv(features, size, stride, self.dtype, f"conv_{name}")(x)
-            return _normalized(x, f"norm_{name}", self.frozen, self.dtype, train, mask)
+            return self._normalize(x, f"norm_{name}", train, mask)
 
         y = nn.relu(block(x, self.features, 1, 1, "1"))
         y = nn.relu(block(y, self.features, 3, self.stride, "2"))
@@ -230,39 +242,31 @@ class Bottleneck(Layer):
         return nn.relu(x + y)
 
 
-def _stage(name: str, depth: int, stride: int, **fields: Any) -> Iterator[Bottleneck]:
-    """Yields the blocks of a stage, of which the first has the stride."""
-    for i in range(depth):
-        yield Bottleneck(stride=1 if i else stride, name=f"{name}_{i + 1}", **fields)
-
-
-class ResNetTrunk(Layer):
+class ResNetTrunk(ResNetLayer):
     """Stem and first three stages of a ResNet, with a stride of 16 in total.
 
     Attributes:
         width: Channels of the stem, 64 in ResNet-50; the output has 16 times as many.
         depths: Number of blocks in each of the three stages.
-        frozen: Whether to normalize with fixed statistics, as in a detector. Otherwise the
-            trunk has batch normalization, for pretraining the weights.
         dtype: Dtype of the computation; the output is float32.
     """
 
     width: int = 64
     depths: tuple[int, int, int] = (3, 4, 6)
-    frozen: bool = True
 
     @nn.compact
     def __call__(
         self, image: Float[jax.Array, "B H W 3"], train: bool = False
     ) -> Float[jax.Array, "B (H+15)//16 (W+15)//16 {16*self.width}"]:
         x = _conv(self.width, 7, 2, self.dtype, "stem_conv")(image)
-        x = nn.relu(_normalized(x, "stem_norm", self.frozen, self.dtype, train))
+        x = nn.relu(self._normalize(x, "stem_norm", train))
         x = nn.max_pool(x, (3, 3), (2, 2), ((1, 1), (1, 1)))
-        fields: dict[str, Any] = {"frozen": self.frozen, "dtype": self.dtype}
         for stage, depth in enumerate(self.depths, 1):
-            stride = 1 if stage == 1 else 2
-            fields["features"] = self.width * 2 ** (stage - 1)
-            for block in _stage(f"stage_{stage}_block", depth, stride=stride, **fields):
+            width = self.width * 2 ** (stage - 1)
+            shared = functools.partial(Bottleneck, frozen=self.frozen, dtype=self.dtype)
+            for i in range(1, depth + 1):
+                stride = 2 if stage > 1 and i == 1 else 1
+                block = shared(width, stride, name=f"stage_{stage}_block_{i}")
                 x = block(x, train)
         return x.astype(jnp.float32)
 
@@ -273,13 +277,11 @@ class ResNetNeck(Layer):
     Attributes:
         features: Output channels.
         width: Channels of the ResNet's stem, 64 in ResNet-50.
-        depth: Number of blocks in the stage.
         dtype: Dtype of the computation and the output.
     """
 
     features: int = 128
     width: int = 64
-    depth: int = 3
 
     @nn.compact
     def __call__(
@@ -287,7 +289,7 @@ class ResNetNeck(Layer):
     ) -> Float[jax.Array, "B (h+1)//2 (w+1)//2 {self.features}"]:
         """Runs the neck; the arguments are those of `CameraNeck`, with x the trunk's output."""
         mask = counted_frames(has_image)
-        fields = {"features": 8 * self.width, "frozen": False, "dtype": self.dtype}
-        for block in _stage("block", self.depth, stride=2, **fields):
-            x = block(x, train, mask)
+        shared = functools.partial(Bottleneck, frozen=False, dtype=self.dtype)
+        for i, stride in enumerate((2, 1, 1), 1):
+            x = shared(8 * self.width, stride, name=f"block_{i}")(x, train, mask)
         return Conv(self.features, 1, use_bias=False, dtype=self.dtype, name="proj")(x)

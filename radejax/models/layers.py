@@ -10,11 +10,12 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import TypedDict
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Float
 
 from radejax.models.convolution import conv2d, plain_conv2d, product
@@ -33,12 +34,16 @@ def uniform_fan_in(fan_in: int) -> Initializer:
     """
     bound = 1.0 / math.sqrt(fan_in)
 
-    def init(key: jax.Array, shape: tuple, dtype: Any = jnp.float32) -> jax.Array:
+    def init(
+        key: jax.Array, shape: tuple[int, ...], dtype: DTypeLike = jnp.float32
+    ) -> jax.Array:
         # The first numbers do not depend on how many are drawn. Rounding the count up
         # therefore changes no weight, but lets many shapes share a compiled generator.
         size = math.prod(shape)
         count = max(2**14, 4 ** math.ceil(math.log(size, 4)))
-        return _cut(jax.random.uniform(key, (count,), dtype, -bound, bound), shape)
+        numbers = jax.random.uniform(key, (count,), dtype, -bound, bound)
+        weights: jax.Array = _cut(numbers, shape)
+        return weights
 
     return init
 
@@ -56,7 +61,15 @@ class Layer(nn.Module, kw_only=True):
         dtype: Dtype of the computation and the output.
     """
 
-    dtype: Any = jnp.float32
+    dtype: DTypeLike = jnp.float32
+
+
+class PartFields(TypedDict):
+    """The fields of a `Part`, by name."""
+
+    num_groups: int
+    dtype: DTypeLike
+    remat: bool
 
 
 class Part(Layer, kw_only=True):
@@ -94,8 +107,8 @@ class Conv(Layer):
     def __call__(self, x: Features) -> Float[jax.Array, "B r a {self.features}"]:
         init = uniform_fan_in(self.size**2 * x.shape[-1])
         shape = (self.size, self.size, x.shape[-1], self.features)
-        kernel = self.param("kernel", init, shape)
-        x, kernel = jnp.asarray(x, self.dtype), jnp.asarray(kernel, self.dtype)
+        kernel = jnp.asarray(self.param("kernel", init, shape), self.dtype)
+        x = jnp.asarray(x, self.dtype)
         if self.stride == 1:
             y = conv2d(x, kernel, self.dilation)
         elif self.size == 1:

@@ -10,8 +10,6 @@ References:
 
 from __future__ import annotations
 
-from typing import Any
-
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -19,6 +17,8 @@ import numpy as np
 from flax import struct
 from jaxtyping import Bool, Float
 
+from radejax.core.structures import Array
+from radejax.geometry.boxes import array_module
 from radejax.geometry.camera import Camera, project
 from radejax.models.layers import Conv, Dense, GroupNorm, Layer
 from radejax.models.options import (
@@ -46,10 +46,10 @@ class ReferencePoints(struct.PyTreeNode):
             have one.
     """
 
-    # The leaves have type Any for the reason given in `radejax.geometry.camera.Camera`.
-    points: Any
-    is_valid: Any
-    has_image: Any = None
+    # Leaves are not validated: JAX also rebuilds the tree with shapes, specs or None.
+    points: Array
+    is_valid: Array
+    has_image: Array | None = None
 
 
 def reference_points(
@@ -78,8 +78,7 @@ def reference_points(
         Reference points, whose leading axis is 1 for one camera and B for a batch.
     """
     is_batch = np.ndim(camera.max_radius) > 0
-    on_host = isinstance(camera.intrinsics, np.ndarray)
-    xp = np if on_host else jnp
+    xp = array_module(camera.intrinsics)
     centers = axes.centers_ego(num_range, num_azimuth, num_elevation, xp)
     if not is_batch:
         camera = jax.tree.map(lambda x: xp.asarray(x)[None], camera)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, Self
+import types
+from typing import Annotated, Literal, Self
 
 import numpy as np
 import pydantic
@@ -11,7 +12,7 @@ from jaxtyping import Float
 
 from radejax.core.errors import require
 from radejax.core.options import BelowOne, Options, Positive, Size, find_part
-from radejax.core.structures import CLASSES
+from radejax.core.structures import CLASSES, Array
 from radejax.geometry.radar_grid import RadarGrid, is_uniform, values_at
 from radejax.models.backbone import BACKBONES, Backbone, CBAMKind
 from radejax.models.heads import HEADS, NECKS, Head, Neck
@@ -133,9 +134,10 @@ class ViTOptions(Options, section="config.model.image"):
 
     @pydantic.model_validator(mode="after")
     def _check_heads(self) -> Self:
-        size, name = self.hidden_size, "config.model.image.hidden_size"
+        size = self.hidden_size
         expected = f"a multiple of 4 channels for each of {self.num_heads} heads"
-        require(size % (4 * self.num_heads) == 0, name, size, expected)
+        is_multiple = size % (4 * self.num_heads) == 0
+        require(is_multiple, "config.model.image.hidden_size", size, expected)
         return self
 
     @property
@@ -233,11 +235,13 @@ class QueryGridOptions(Options, section="config.model.query_grid"):
 
         A grid with fewer than two elevations gets those of K-Radar, -18 to 18 degrees.
         """
-        range_m, azimuth, elevation = grid.range_m, grid.azimuth_rad, grid.elevation_rad
+        range_m = grid.range_m
         if is_uniform(range_m):
             range_m = np.array([range_m[0], grid.range_step_m])
+        azimuth = grid.azimuth_rad
         if is_uniform(azimuth):
             azimuth = np.array([azimuth[0], grid.azimuth_step_rad])
+        elevation = grid.elevation_rad
         if elevation.size < 2:
             elevation = RadarGrid.kradar().elevation_rad
         return cls(
@@ -256,8 +260,12 @@ class QueryGridOptions(Options, section="config.model.query_grid"):
         )
 
     def centers_ego(
-        self, num_range: int, num_azimuth: int, num_elevation: int, xp: Any = np
-    ) -> Float[Any, "{num_range} {num_azimuth} {num_elevation} 3"]:
+        self,
+        num_range: int,
+        num_azimuth: int,
+        num_elevation: int,
+        xp: types.ModuleType = np,
+    ) -> Float[Array, "{num_range} {num_azimuth} {num_elevation} 3"]:
         """Returns the query centers `[R, A, E, 3]` in the ego frame in meters.
 
         They are computed as an outer product of small tables, so that with `jax.numpy` as
@@ -274,7 +282,8 @@ class QueryGridOptions(Options, section="config.model.query_grid"):
         axes = np.broadcast_arrays(x, y, np.sin(elevation))
         dtype = np.float64 if xp is np else np.float32
         unit = xp.asarray(np.stack(axes, -1)[None], dtype)
-        return xp.asarray(range_m.reshape(-1, 1, 1, 1), dtype) * unit
+        centers: Array = xp.asarray(range_m.reshape(-1, 1, 1, 1), dtype) * unit
+        return centers
 
 
 def _centers(axis: tuple[float, ...], count: int) -> Float[np.ndarray, " {count}"]:
@@ -296,17 +305,20 @@ class DinoRadeOptions(RadeNetOptions):
 
     @pydantic.model_validator(mode="after")
     def _check_camera(self) -> Self:
-        fusion, size, width = self.fusion, self.image.size, self.decoder_width
+        size = self.image.size
         expected = (
             f"a width above {2 * MARGIN_PX} for config.model.fusion.out_of_view = "
             f"'official', which leaves out {MARGIN_PX} pixels left and right"
         )
-        is_possible = fusion.out_of_view == "drop" or size[1] > 2 * MARGIN_PX
+        is_possible = self.fusion.out_of_view == "drop" or size[1] > 2 * MARGIN_PX
         require(is_possible, "config.model.image.size", size, expected)
-        kind, name = fusion.weighting, "config.model.fusion.weighting"
+        kind = self.fusion.weighting
         is_possible = self.elevation_bins > 0 or kind == "off"
-        require(is_possible, name, kind, "'off' without elevation channels")
-        heads, expected = fusion.num_heads, f"a divisor of decoder_width = {width}"
+        expected = "'off' without elevation channels"
+        require(is_possible, "config.model.fusion.weighting", kind, expected)
+        heads = self.fusion.num_heads
+        width = self.decoder_width
+        expected = f"a divisor of decoder_width = {width}"
         require(width % heads == 0, "config.model.fusion.num_heads", heads, expected)
         return self
 

@@ -6,7 +6,7 @@ References:
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TypeVar
 
 import flax.linen as nn
 import jax
@@ -18,10 +18,11 @@ from radejax.core.options import find_part
 from radejax.core.structures import DetectionMaps
 from radejax.models.backbone import BACKBONES
 from radejax.models.heads import NECKS, Heads
-from radejax.models.layers import Map
+from radejax.models.layers import Map, Part, PartFields
 from radejax.models.options import RadeNetOptions
 
 Projection = Float[jax.Array, "B R A DE"]
+PartT = TypeVar("PartT", bound=Part)
 
 
 class RadeNet(nn.Module):
@@ -81,7 +82,7 @@ class RadeNet(nn.Module):
         """Applies the backbone."""
         options = self.options
         backbone = find_part(options.backbone, "config.model.backbone", BACKBONES)
-        return self._stage(backbone)(
+        features: Map = self._stage(backbone)(
             doppler_bins=self.num_frames * options.doppler_bins,
             widths=options.widths,
             decoder_width=options.decoder_width,
@@ -90,6 +91,7 @@ class RadeNet(nn.Module):
             **self._shared(),
             name="backbone",
         )(padded)
+        return features
 
     def _maps(
         self, features: Float[jax.Array, "B Rp Ap C"], projection: Projection
@@ -105,15 +107,15 @@ class RadeNet(nn.Module):
             name="heads",
         )
         maps = heads(neck(**self._shared(), name="neck")(features))
-        if not options.crop_output:
-            return maps
-        r, a = projection.shape[1:3]
-        return jax.tree.map(lambda m: m[:, :r, :a], maps)
+        if options.crop_output:
+            r, a = projection.shape[1:3]
+            maps = jax.tree.map(lambda m: m[:, :r, :a], maps)
+        return maps
 
-    def _stage(self, module: Any) -> Any:
-        return nn.remat(module) if self.options.remat == "full" else module
+    def _stage(self, part: type[PartT]) -> type[PartT]:
+        return nn.remat(part) if self.options.remat == "full" else part
 
-    def _shared(self) -> dict[str, Any]:
+    def _shared(self) -> PartFields:
         return {
             "num_groups": self.options.num_groups,
             "dtype": jnp.dtype(self.options.dtype),

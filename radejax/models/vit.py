@@ -12,13 +12,14 @@ References:
 from __future__ import annotations
 
 import functools
-from typing import Any
+from collections.abc import Callable
 
 import chex
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Float
 
 from radejax.models.layers import Layer
@@ -74,19 +75,17 @@ class ViT(Layer):
             in_axes=nn.broadcast,
             length=options.num_layers,
         )
-        tokens, _ = layers(
-            options,
-            self.dtype,
-            name="layers",
-        )(tokens, rope)
-        return _layer_norm(rope, jnp.float32, "norm")(tokens)
+        tokens, _ = layers(options, self.dtype, name="layers")(tokens, rope)
+        normalized: Tokens = _layer_norm(rope, jnp.float32, "norm")(tokens)
+        return normalized
 
     def _embed(
         self, image: Float[jax.Array, "B H W 3"], rows: int, columns: int
     ) -> Float[jax.Array, "B T {self.options.hidden_size}"]:
         """Embeds patches by a linear layer and prepends the learned tokens."""
         options = self.options
-        b, size = image.shape[0], options.patch_size
+        b = image.shape[0]
+        size = options.patch_size
         # As patches do not overlap, the convolution is a product with flattened patches.
         patches = image.reshape(b, rows, size, columns, size, 3)
         patches = patches.transpose(0, 1, 3, 2, 4, 5).reshape(b, rows * columns, -1)
@@ -114,7 +113,7 @@ class Block(nn.Module):
     """Transformer block with scaled residual branches; its attributes are those of `ViT`."""
 
     options: ViTOptions
-    dtype: Any
+    dtype: DTypeLike
 
     @nn.compact
     def __call__(self, x: Tokens, rope: Rope | None) -> tuple[Tokens, None]:
@@ -156,7 +155,7 @@ class Block(nn.Module):
         return scale[None, None]
 
 
-def _layer_norm(rope: Rope | None, dtype: Any, name: str) -> nn.LayerNorm:
+def _layer_norm(rope: Rope | None, dtype: DTypeLike, name: str) -> nn.LayerNorm:
     epsilon = 1e-6 if rope is None else 1e-5  # DINOv2's and DINOv3's
     # The fast variance E[x^2] - E[x]^2 is imprecise if the mean is large.
     return nn.LayerNorm(epsilon, dtype=dtype, use_fast_variance=False, name=name)
@@ -191,7 +190,8 @@ def bicubic_weights(
         weights = weights[:, 2:-2] / weights[:, 2:-2].sum(1, keepdims=True)
     else:
         weights = weights @ np.eye(old)[samples.clip(0, old - 1)]
-    return weights.astype(np.float32)
+    rounded: np.ndarray = weights.astype(np.float32)
+    return rounded
 
 
 def rotary_angles(rows: int, columns: int, head_dim: int, theta: float = 100.0) -> Rope:
@@ -216,7 +216,7 @@ def rotary_angles(rows: int, columns: int, head_dim: int, theta: float = 100.0) 
         position = 2.0 * (np.arange(count) + 0.5) / count - 1.0
         return 2.0 * np.pi * position[:, None] * frequency  # [count, head_dim / 4]
 
-    def table(function: Any) -> jax.Array:
+    def table(function: np.ufunc) -> jax.Array:
         # Only the tables per axis are constants of the compiled program, which expands
         # them to the full table.
         by_row = jnp.asarray(function(axis_angles(rows)), jnp.float32)
@@ -231,12 +231,11 @@ def rotary_angles(rows: int, columns: int, head_dim: int, theta: float = 100.0) 
 
 def rotate(x: PerHead, rope: Rope, num_prefix: int) -> PerHead:
     """Applies the rotary embedding to the patch tokens and leaves the prefix unchanged."""
-    prefix, patches = x[:, :num_prefix], x[:, num_prefix:]
     cos, sin = (a[None, :, None].astype(jnp.float32) for a in rope)
-    wide = patches.astype(jnp.float32)
+    wide = x[:, num_prefix:].astype(jnp.float32)
     first, second = jnp.split(wide, 2, -1)
     turned = wide * cos + jnp.concatenate([-second, first], -1) * sin
-    return jnp.concatenate([prefix, turned.astype(x.dtype)], 1)
+    return jnp.concatenate([x[:, :num_prefix], turned.astype(x.dtype)], 1)
 
 
 # Attention ---------------------------------------------------------------------------
@@ -264,13 +263,14 @@ def attend(
     plain = jax.nn.dot_product_attention
     if kind == "auto":
         is_half = query.dtype in (jnp.bfloat16, jnp.float16)
-        flash = {}
+        flash: dict[str, Callable[..., jax.Array]] = {}
         if is_half and jax.default_backend() == "gpu":  # tracing "cudnn" needs a GPU
             flash["cuda"] = functools.partial(plain, implementation="cudnn")
         # The choice is made at lowering, so that a traced program runs on each platform.
-        return jax.lax.platform_dependent(
+        out: PerHead = jax.lax.platform_dependent(
             query, key, value, cpu=_attend_blocked, default=plain, **flash
         )
+        return out
     if kind == "blocked":
         return _attend_blocked(query, key, value)
     return plain(query, key, value, implementation=kind)
@@ -298,7 +298,9 @@ def _attend_blocked(query: OfSample, key: OfSample, value: OfSample) -> OfSample
             total = weights.sum(0, keepdims=True)
             return ((values @ weights.astype(x.dtype)) / total).astype(x.dtype)
 
-        return jax.lax.map(one_block, blocks)
+        attended: jax.Array = jax.lax.map(one_block, blocks)
+        return attended
 
-    out = jax.lax.map(one_head, (queries, keys, values))  # [heads, n, d, block]
+    # [heads, n, d, block]
+    out: jax.Array = jax.lax.map(one_head, (queries, keys, values))
     return out.swapaxes(2, 3).reshape(heads, -1, d)[:, :t].swapaxes(0, 1)
