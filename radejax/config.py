@@ -259,7 +259,7 @@ def with_texts(config: Config, texts: Mapping[str, str]) -> Config:
 def _read_text(config: Config, name: str, text: str) -> object:
     """Returns the first reading of a text that the type of a field allows."""
     *sections, field = name.split(".")
-    place: object = config
+    place: Any = config
     for section in sections:
         is_mapping = isinstance(place, Mapping)
         place = place[section] if is_mapping else getattr(place, section)

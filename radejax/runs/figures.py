@@ -19,7 +19,7 @@ from radejax.data.pipeline import read_sample, sample_keys
 from radejax.data.projection import decode
 from radejax.evaluation.results import condition_masks
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.models.dinorade import DinoRade
+from radejax.models.radenet import RadeNet
 from radejax.runs.data import Data
 from radejax.visualize.style import Scene
 
@@ -63,7 +63,7 @@ def spread(values: Sequence[T], count: int) -> list[T]:
 
 
 def frame_shares(
-    model: DinoRade,
+    model: RadeNet,
     variables: VariableDict,
     data: Data,
     frames: FrameSequence,
