@@ -15,7 +15,7 @@ import itertools
 import pathlib
 import re
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
@@ -170,7 +170,7 @@ def type_text(annotation: Any, limits: Iterable[Any] = ()) -> str:
         if least := bounds.get("min_length"):
             count = f"{least} or more "
         return f"tuple of {count}{' and '.join(kinds)}"
-    if origin is dict:
+    if origin is Mapping:
         return f"dictionary of {type_text(arguments[1])}"
     if issubclass(annotation, Options):
         return f"fields of `{annotation.__name__}`"
@@ -207,6 +207,8 @@ def code(value: Any) -> str:
     """A value as code; nothing for an empty text."""
     if isinstance(value, Options):
         value = value.model_dump(exclude_none=True)
+    if isinstance(value, Mapping):  # its own text may have several lines
+        value = dict(value)
     return f"`{value}`" * (value != "")
 
 

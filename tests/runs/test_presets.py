@@ -43,7 +43,7 @@ def test_the_page_has_every_field_of_both_presets(
     for i, preset in enumerate(("paper", "official")):
         values = load_config(f"{config}:{preset}")
         fields = {re.sub(r"weights\..*", "weights", n): x for n, x in values.fields()}
-        fields["loss.weights"] = values.loss.weights
+        fields["loss.weights"] = dict(values.loss.weights)
         for section in ("simulation", "data.camera"):  # those of None
             fields.pop(section, None)
         assert set(rows) == set(fields)
