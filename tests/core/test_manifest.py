@@ -3,6 +3,7 @@
 import json
 
 import pytest
+
 from radejax.core.errors import DataError, UserError
 from radejax.core.manifest import Manifest, state_of
 
