@@ -21,6 +21,7 @@ from typing import Any
 import click
 
 from radejax.core.compilation_cache import enable_compilation_cache
+from radejax.core.errors import UserError, one_line
 from radejax.core.files import is_no_space
 
 Function = Callable[..., object]
@@ -95,8 +96,17 @@ def _message(error: BaseException) -> str:
     return message
 
 
-def set_up_jax() -> None:
-    """Sets up logging at level info and JAX's persistent compilation cache."""
+def set_up_jax(*, is_distributed: bool = False) -> None:
+    """Sets up logging at level info, JAX's persistent compilation cache and its devices.
+
+    Args:
+        is_distributed: Whether the process will join others, before which it may not use
+            the devices.
+
+    Raises:
+        UserError: There is no device of the platform `JAX_PLATFORMS`.
+    """
+    import jax
     from absl import flags
 
     log = logging.getLogger("radejax")
@@ -108,6 +118,17 @@ def set_up_jax() -> None:
         log.propagate = False
     flags.FLAGS.mark_as_parsed()  # grain's worker processes read an absl flag
     enable_compilation_cache()
+    if is_distributed:
+        return
+    try:
+        jax.devices()
+    except (AssertionError, RuntimeError) as error:
+        reason = one_line(error) or "the platform has no device"
+        raise UserError(
+            f"JAX_PLATFORMS is {jax.config.jax_platforms!r}, and JAX cannot use it: "
+            f"{reason}; expected an accelerator that is there and `pip install "
+            "'radejax[cuda]'` or '[tpu]', or JAX_PLATFORMS=cpu"
+        ) from None
 
 
 # Commands ----------------------------------------------------------------------------

@@ -101,11 +101,12 @@ def train(
     from radejax.core.devices import end_with_others
     from radejax.runs.experiment import run, run_seeds
 
-    entry.set_up_jax()
     place = [data.pop(n) for n in ("coordinator", "num_processes", "process_id")]
+    is_distributed = distributed or place != [None] * 3
+    entry.set_up_jax(is_distributed=is_distributed)
     workdir = workdir or f"runs/{config_name(config)}"
     with contextlib.ExitStack() as processes:
-        if distributed or place != [None] * 3:
+        if is_distributed:
             join_processes(*place)
             processes.enter_context(end_with_others())
         # Parts that a config names are imported, and may use JAX.

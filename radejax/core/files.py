@@ -6,12 +6,15 @@ import contextlib
 import errno
 import fcntl
 import fnmatch
+import functools
 import json
 import logging
 import os
 import pathlib
+import re
 import shutil
 import socket
+import uuid
 from collections.abc import Collection, Iterator, Mapping
 from typing import IO, Any
 
@@ -24,6 +27,7 @@ JsonObject = dict[str, Any]
 _log = logging.getLogger(__name__)
 
 _MAX_VALUE_CHARS = 80
+_SHORT_WRITE = re.compile(r"\d+ requested and \d+ written")  # of numpy.ndarray.tofile
 
 
 # Writing -----------------------------------------------------------------------------
@@ -40,7 +44,7 @@ def atomic_path(path: PathLike) -> Iterator[pathlib.Path]:
         DiskFullError: No space is left on the disk.
     """
     path = as_path(path)
-    temporary = _temporary_path(path)
+    temporary = temporary_path(path)
     try:
         with disk_full(path):
             yield temporary
@@ -70,7 +74,7 @@ def swapped_in(folder: PathLike) -> Iterator[pathlib.Path]:
         DiskFullError: No space is left on the disk.
     """
     folder = as_path(folder)
-    temporary = _temporary_path(folder)
+    temporary = temporary_path(folder)
     remove_stale(folder.parent, f".{folder.name}.")
     try:
         with disk_full(folder):
@@ -96,15 +100,26 @@ def write_json(path: PathLike, value: object) -> None:
     write_text(path, json.dumps(value, indent=2) + "\n")
 
 
-def _temporary_path(path: pathlib.Path) -> pathlib.Path:
+def temporary_path(path: pathlib.Path) -> pathlib.Path:
     """Returns a path next to another one, whose missing parent folders are created."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    return path.with_name(f".{path.name}.{socket.gethostname()}.{os.getpid()}.tmp")
+    # Containers may have equal host names and process ids.
+    unique = uuid.uuid4().hex[:8]
+    return path.with_name(f".{path.name}.{_machine()}.{unique}.{os.getpid()}.tmp")
+
+
+@functools.cache
+def _machine() -> str:
+    """Returns the host name, and on Linux the number of the container's processes."""
+    try:
+        return f"{socket.gethostname()}.{os.stat('/proc/self/ns/pid').st_ino}"
+    except OSError:
+        return socket.gethostname()
 
 
 def remove_stale(folder: pathlib.Path, prefix: str = "**/.") -> None:
     """Removes temporary files that killed processes on this machine left in a folder."""
-    for path in list(folder.glob(f"{prefix}*{socket.gethostname()}.*.tmp")):
+    for path in list(folder.glob(f"{prefix}*.{_machine()}.*.tmp")):
         process = path.name.split(".")[-2]
         if process.isdecimal() and not _is_running(int(process)):
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
@@ -145,10 +160,12 @@ def is_no_space(error: BaseException) -> bool:
     """Returns whether an error reports a full disk or an exhausted quota.
 
     C++ libraries pass on the system's error message but not its error number, so the
-    message is searched as well.
+    message is searched as well. NumPy passes on neither.
     """
     numbers = (errno.ENOSPC, errno.EDQUOT)
     if isinstance(error, OSError) and error.errno in numbers:
+        return True
+    if isinstance(error, OSError) and _SHORT_WRITE.fullmatch(str(error)):
         return True
     return any(os.strerror(number) in str(error) for number in numbers)
 
@@ -285,7 +302,7 @@ def claim(
             as "another simulation".
         fix: Advice at the end of the error message.
         name: Prefix of the field names in the error message.
-        ignore: Top-level fields that may differ.
+        ignore: Fields that may differ, such as "train.num_epochs".
 
     Raises:
         UserError: The folder belongs to another job; the message names the fields that
@@ -298,22 +315,30 @@ def claim(
     except FileNotFoundError:
         write_json(path, wanted)
         return
-    pair = (found, json.loads(json.dumps(wanted)))
-    found, wanted = ({k: v for k, v in x.items() if k not in ignore} for x in pair)
-    if lines := differences(found, wanted, name):
+    ignored = [f"{name}.{field}".removeprefix(".") for field in ignore]
+    if lines := differences(found, json.loads(json.dumps(wanted)), name, ignored):
         place = relative(path.parent)
         raise UserError(f"{place} holds {what}: {'; '.join(lines)}; {fix}")
 
 
-def differences(found: object, wanted: object, name: str = "config") -> list[str]:
-    """Returns one line per difference between two trees of values read from JSON."""
-    if found == wanted:
+def differences(
+    found: object, wanted: object, name: str = "config", ignore: Collection[str] = ()
+) -> list[str]:
+    """Returns one line per difference between two trees of values read from JSON.
+
+    Args:
+        found: The values that are there.
+        wanted: The values that are expected.
+        name: Name of the trees, the prefix of the field names.
+        ignore: Full names of fields that may differ.
+    """
+    if found == wanted or name in ignore:
         return []
     if isinstance(found, Mapping) and isinstance(wanted, Mapping):
         lines = []
         for key in sorted(set(found) | set(wanted)):
             field = f"{name}.{key}".removeprefix(".")
-            lines += differences(found.get(key), wanted.get(key), field)
+            lines += differences(found.get(key), wanted.get(key), field, ignore)
         return lines
     if max(len(repr(found)), len(repr(wanted))) > _MAX_VALUE_CHARS:
         return [f"{name} differs"]

@@ -3,7 +3,7 @@
 The workdir of a run contains
 
 config.json      the configuration without the paths of the data, which the checkpoints
-                 contain; it does not change after the first checkpoint
+                 contain; after the first checkpoint, only its logging and length may change
 run.json         versions, command, weights that the training started from
 checkpoints/     the newest checkpoints and the best one, by step
 metrics.jsonl    losses by step; tensorboard/ has the same values
@@ -38,7 +38,7 @@ import radejax
 from radejax import models
 from radejax.config import Config
 from radejax.core import devices, files
-from radejax.core.errors import require
+from radejax.core.errors import UserError, require
 from radejax.core.files import JsonObject, PathLike
 from radejax.core.structures import Batch
 from radejax.data.dataset import FrameSequence
@@ -264,6 +264,11 @@ def fit(
         )
         start = int(state.step)
         num_steps = count_steps(config.train, data.steps_per_epoch)
+        if start > num_steps:
+            raise UserError(
+                f"{workdir} is at step {start}, and config.train.num_epochs or max_steps "
+                f"makes it end after {num_steps}: make it longer, or give another --workdir"
+            )
         writer = stack.enter_context(MetricWriter(workdir, config, start))
         bar = stack.enter_context(hooks.ProgressBar(start, num_steps))
         should_stop = stack.enter_context(devices.stop_on_signal(mesh))
@@ -352,13 +357,25 @@ def _make_state_and_step(
 
 # Workdir -----------------------------------------------------------------------------
 
+_MAY_CHANGE = (
+    "logging",
+    "train.checkpoint_every_steps",
+    "train.checkpoints_to_keep",
+    "train.evaluate_every_epochs",
+    "train.log_every_steps",
+    "train.max_skipped_steps",
+    "train.max_steps",
+    "train.num_epochs",
+)
+"""Fields that may change when a run continues. With more steps, a run becomes longer."""
+
 
 @contextlib.contextmanager
 def claimed(workdir: pathlib.Path, config: Config) -> Iterator[None]:
     """Locks a workdir for a training with a config while a block runs.
 
-    The workdir is created if missing. If it has no checkpoint yet, the given config
-    replaces the one in it.
+    The workdir is created if missing. The given config replaces the one in it. If there
+    is a checkpoint, only the fields `_MAY_CHANGE` may differ.
 
     Raises:
         UserError: Another process holds the lock; or the workdir belongs to a run with
@@ -370,17 +387,23 @@ def claimed(workdir: pathlib.Path, config: Config) -> Iterator[None]:
         f"another training is at work in {files.relative(workdir)}: wait for its end, or "
         "give another --workdir"
     )
+    what = "a run with another config"
+    fix = "give another --workdir, or remove that one"
     with contextlib.ExitStack() as held:
 
         def take() -> None:
             held.enter_context(files.lock(workdir / "lock", message))
-            if not any(workdir.glob("checkpoints/*")):
-                files.write_json(path, content)
+            if any(workdir.glob("checkpoints/*")):
+                files.claim(
+                    path, content, what, fix=fix, name="config", ignore=_MAY_CHANGE
+                )
+                for line in files.differences(files.read_json(path), content):
+                    _log.warning("the run continues with another config: %s", line)
+            files.write_json(path, content)
 
         devices.main_only(take)
-        what = "a run with another config"
-        fix = "give another --workdir, or remove that one"
-        files.claim(path, content, what, fix=fix, name="config", ignore=("logging",))
+        # The config of every process has to be that of the main one.
+        files.claim(path, content, what, fix=fix, name="config")
         yield
 
 

@@ -283,6 +283,6 @@ def _prepare_in_worker(spec: FrameSpec) -> str:
 
     The result itself is too large to be returned by a worker.
     """
-    path = _writer.root / f".{spec.sequence}_{spec.name}.tmp"
+    path = files.temporary_path(_writer.root / f"{spec.sequence}_{spec.name}")
     path.write_bytes(pickle.dumps(_writer.prepare(spec)))
     return str(path)

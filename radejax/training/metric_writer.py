@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import math
 import pathlib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
@@ -78,8 +79,9 @@ class MetricWriter:
         if self._board is None:
             return
         with files.disk_full(self._path):
+            record = {n: x if math.isfinite(x) else None for n, x in values.items()}
             with self._path.open("a") as file:
-                file.write(json.dumps({"step": step, **values}) + "\n")
+                file.write(json.dumps({"step": step, **record}) + "\n")
             self._board.flush()  # raises an error if the writer thread failed
             for name, value in values.items():
                 self._board.add_scalar(name, value, step)

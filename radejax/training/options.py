@@ -23,10 +23,9 @@ class TrainOptions(Options, section="config.train"):
     batch_size: AtLeastOne = 10
     """Frames per step over all devices."""
     num_epochs: AtLeastOne = 10
-    """Passes over the training data."""
+    """Passes over the training data, unless `max_steps` is given."""
     max_steps: AtLeastOne | None = None
-    """Steps after which the training ends if its epochs are longer; the learning rate
-    decreases over the steps that are taken. None: all epochs."""
+    """Steps of the training, however many epochs they take. None: those of `num_epochs`."""
     learning_rate: Positive = 1e-3
     """Peak learning rate of AdamW."""
     final_learning_rate: NotNegative = 1e-4

@@ -31,9 +31,17 @@ Step = Callable[["TrainState", Batch, jax.Array], tuple["TrainState", Metrics]]
 
 
 def count_steps(train: TrainOptions, steps_per_epoch: int) -> int:
-    """Returns the number of steps of a training with the section `config.train`."""
-    steps: int = steps_per_epoch * train.num_epochs
-    return steps if train.max_steps is None else min(train.max_steps, steps)
+    """Returns the number of steps of a training with the section `config.train`.
+
+    Raises:
+        UserError: The training ends before the first update of the parameters.
+    """
+    steps = train.max_steps or steps_per_epoch * train.num_epochs
+    count = train.gradient_accumulation_steps
+    expected = f"at most the {steps} steps of the training"
+    name = "config.train.gradient_accumulation_steps"
+    require(count <= steps, name, count, expected)
+    return steps
 
 
 def make_schedule(train: TrainOptions, steps_per_epoch: int) -> optax.Schedule:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -87,8 +88,9 @@ def read_metrics(path: files.PathLike) -> dict[str, tuple[np.ndarray, np.ndarray
         except (ValueError, TypeError, LookupError, AttributeError) as error:
             raise DataError(f"{path}, line {number} is corrupted: {error}") from None
         for name, value in record.items():
-            if isinstance(value, int | float):
-                series.setdefault(name, []).append((step, float(value)))
+            if value is None or isinstance(value, int | float):
+                number = math.nan if value is None else float(value)
+                series.setdefault(name, []).append((step, number))
     return {name: tuple(np.array(rows).T) for name, rows in series.items()}
 
 

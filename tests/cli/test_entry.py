@@ -1,6 +1,8 @@
 """One line and an exit code for the user's errors; a traceback for ours."""
 
 import errno
+import os
+import subprocess
 import sys
 
 import click
@@ -76,6 +78,17 @@ def test_a_coordinator_that_is_not_reached_is_one_line(
         UserError, match=r"cannot join the other processes \(DEADLINE.*"
     ):
         join_processes("h:1", 2, 1)
+
+
+def test_an_accelerator_that_is_not_there_is_one_line() -> None:
+    command = [sys.executable, "-m", "radejax", "demo", "--out", "demo.png"]
+    environment = {**os.environ, "JAX_PLATFORMS": "cuda"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True)
+    assert done.returncode == entry.WRONG_USE
+    assert done.stderr.startswith(
+        "error: JAX_PLATFORMS is 'cuda', and JAX cannot use it"
+    )
+    assert done.stderr.count("\n") == 1
 
 
 def test_home_folders_in_arguments(monkeypatch: pytest.MonkeyPatch) -> None:

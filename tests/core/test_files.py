@@ -5,6 +5,7 @@ import os
 import pathlib
 import stat
 
+import numpy as np
 import pytest
 
 from radejax.core import files
@@ -42,6 +43,23 @@ def test_full_disk_is_one_clear_error(tmp_path: pathlib.Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_temporary_paths_differ_in_one_process(tmp_path: pathlib.Path) -> None:
+    # Two containers may have equal host names and process ids.
+    paths = {files.temporary_path(tmp_path / "a.npy") for _ in range(100)}
+    assert len(paths) == 100
+
+
+@pytest.mark.skipif(not pathlib.Path("/dev/full").exists(), reason="only on Linux")
+def test_a_short_write_of_numpy_is_a_full_disk() -> None:
+    # NumPy raises an OSError without an error number.
+    with (
+        pytest.raises(UserError, match="no space left on the disk of"),
+        files.disk_full("x/a.npy"),
+        open("/dev/full", "wb") as file,
+    ):
+        np.save(file, np.zeros(100_000))
+
+
 def test_other_errors_of_a_disk_stay_as_they_are() -> None:
     with pytest.raises(OSError, match="Input/output"), files.disk_full("x/a.json"):
         raise OSError(errno.EIO, "Input/output error")
@@ -58,7 +76,8 @@ def test_a_folder_is_one_jobs(tmp_path: pathlib.Path) -> None:
     plan = {"a": {"b": (1, 2), "long": list(range(90))}, "seed": 0, "watch": 1}
     files.claim(path, plan, "another job")
     assert files.read_json(path)["a"]["b"] == [1, 2]
-    files.claim(path, {**plan, "watch": 2}, "another job", ignore=("watch",))
+    changed = {**plan, "watch": 2, "a": {**plan["a"], "b": 3}}
+    files.claim(path, changed, "another job", ignore=("watch", "a.b"))
     other = {"a": {"b": (1, 3), "long": []}, "watch": 1}
     with pytest.raises(
         UserError,

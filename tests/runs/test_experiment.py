@@ -178,7 +178,7 @@ def test_a_batch_that_does_not_divide_is_rejected_first(
 
 
 def test_a_work_folder_keeps_its_config_and_rejects_another(
-    tmp_path: pathlib.Path,
+    tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     config = Config()
     # As long as nothing is trained, the folder takes another config.
@@ -195,6 +195,13 @@ def test_a_work_folder_keeps_its_config_and_rejects_another(
         claimed(tmp_path, kept.replace(seed=5, train={"batch_size": 3})),
     ):
         pass
+    longer = kept.replace(train={"num_epochs": 9}, logging={"num_visualizations": 1})
+    with claimed(tmp_path, longer):
+        pass
+    assert Config(**json.loads((tmp_path / "config.json").read_text())) == longer
+    lines = "\n".join(caplog.messages)
+    assert "another config: config.train.num_epochs is 7 there and 9 here" in lines
+    assert "config.logging.num_visualizations is 4 there and 1 here" in lines
 
 
 def test_a_second_training_in_a_work_folder_is_rejected(tmp_path: pathlib.Path) -> None:

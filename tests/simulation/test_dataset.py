@@ -4,7 +4,6 @@ import hashlib
 import json
 import multiprocessing
 import os
-import socket
 import subprocess
 import sys
 
@@ -13,6 +12,7 @@ import pytest
 from PIL import Image
 
 from radejax import Detector, models
+from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.data.cameras import CameraOptions, camera_inputs
 from radejax.data.kradar import KRadar, read_labels
@@ -147,10 +147,8 @@ class TestRepeating:
         # A killed writer leaves its temporary file; a living one's is not touched.
         dead = subprocess.Popen([sys.executable, "-c", ""])
         dead.wait()
-        left, busy = (
-            root / "1" / f".tesseract_00001.mat.{socket.gethostname()}.{process}.tmp"
-            for process in (dead.pid, os.getpid())
-        )
+        busy = files.temporary_path(root / "1" / "tesseract_00001.mat")
+        left = busy.with_name(busy.name.replace(f".{os.getpid()}.", f".{dead.pid}."))
         left.write_bytes(b"half")
         busy.write_bytes(b"half")
         simulate_dataset(small_config(), root, progress=False)

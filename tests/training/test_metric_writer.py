@@ -2,6 +2,7 @@
 
 import errno
 import json
+import math
 import pathlib
 import sys
 from unittest import mock
@@ -35,10 +36,10 @@ def test_records_after_the_restored_step_are_written_anew(
         file.write('{"step": 8, "foc')  # killed while writing
     with _writer(tmp_path, 4) as writer:
         assert _steps(tmp_path) == [2, 4]
-        writer.write(6, {"focal": 60.0})
+        writer.write(6, {"focal": 60.0, "gwd": math.nan})
     assert _steps(tmp_path) == [2, 4, 6]
-    last = json.loads((tmp_path / "metrics.jsonl").read_text().splitlines()[-1])
-    assert last == {"step": 6, "focal": 60.0}
+    last = (tmp_path / "metrics.jsonl").read_text().splitlines()[-1]
+    assert last == '{"step": 6, "focal": 60.0, "gwd": null}'  # NaN is not JSON
 
 
 def test_the_final_results_are_in_tensorboard(tmp_path: pathlib.Path) -> None:

@@ -41,7 +41,7 @@ CYCLIC = {"schedule": "cyclic_cosine", "final_learning_rate": 1e-5}
             (0, 5e-4, 1e-3, 5.5e-4, 1e-4),
         ),
         (_schedule(50, 9, max_steps=100), (0, 50, 100), (1e-3, 5.5e-4, 1e-4)),
-        (_schedule(50, 2, max_steps=101), (0, 50, 100), (1e-3, 5.5e-4, 1e-4)),
+        (_schedule(50, 1, max_steps=100), (0, 50, 100), (1e-3, 5.5e-4, 1e-4)),
         (_schedule(10, 6, max_steps=20, **CYCLIC), (0, 10, 20), (1e-3, 1e-5, 1e-3)),
         (
             _schedule(10, 6, warmup_steps=4, **CYCLIC),

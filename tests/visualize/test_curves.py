@@ -24,11 +24,14 @@ def test_precision_over_recall_in_order_of_recall():
 
 def test_series_of_a_run_are_read_and_drawn(tmp_path):
     path = tmp_path / "metrics.jsonl"
-    lines = [json.dumps({"step": s, "focal": 1 / s, "gwd": 0.5}) for s in (1, 2, 4)]
+    rows = [{"step": s, "focal": 1 / s, "gwd": 0.5} for s in (1, 2, 4)]
+    rows[1]["gwd"] = None  # not finite
+    lines = map(json.dumps, rows)
     text = "\n".join(lines) + "\n"
     path.write_text(text + '{"step": 5, "foc')
     series = curves.read_metrics(path)
     np.testing.assert_array_equal(series["focal"], [[1, 2, 4], [1, 0.5, 0.25]])
+    np.testing.assert_array_equal(series["gwd"], [[1, 2, 4], [0.5, np.nan, 0.5]])
     figure = curves.draw_training(series, ["focal", "gwd"], "run")
     assert [ax.get_title() for ax in figure.axes] == ["focal", "gwd"]
     path.write_text(text + "oops\n")
