@@ -125,7 +125,7 @@ def set_up_jax(*, is_distributed: bool = False) -> None:
     except (AssertionError, RuntimeError) as error:
         reason = one_line(error) or "the platform has no device"
         raise UserError(
-            f"JAX_PLATFORMS is {jax.config.jax_platforms!r}, and JAX cannot use it: "
+            f"JAX_PLATFORMS is {os.environ.get('JAX_PLATFORMS')!r}, and JAX cannot use it: "
             f"{reason}; expected an accelerator that is there and `pip install "
             "'radejax[cuda]'` or '[tpu]', or JAX_PLATFORMS=cpu"
         ) from None

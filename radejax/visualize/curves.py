@@ -89,8 +89,8 @@ def read_metrics(path: files.PathLike) -> dict[str, tuple[np.ndarray, np.ndarray
             raise DataError(f"{path}, line {number} is corrupted: {error}") from None
         for name, value in record.items():
             if value is None or isinstance(value, int | float):
-                number = math.nan if value is None else float(value)
-                series.setdefault(name, []).append((step, number))
+                finite = math.nan if value is None else float(value)
+                series.setdefault(name, []).append((step, finite))
     return {name: tuple(np.array(rows).T) for name, rows in series.items()}
 
 
