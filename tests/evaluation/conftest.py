@@ -28,26 +28,6 @@ def assert_stored():
 
 
 @pytest.fixture(scope="session")
-def kradar_fixture(shared):
-    """Columns of the shared K-Radar evaluation set, and the frame weathers."""
-    folder = shared / "fixtures" / "kradar_eval"
-    truth, found = (
-        np.load(folder / f"{name}.npz") for name in ("ground_truth", "predictions")
-    )
-    names = truth["class_names"]
-    frames = {
-        "frame": np.arange(truth["frame_name"].size),
-        "name": truth["frame_name"],
-        "sequence": truth["frame_seq"],
-        "weather": truth["frame_weather"],
-    }
-    ground_truth = {k: truth[k] for k in ("frame", "box")}
-    predictions = {k: found[k] for k in ("frame", "box", "score", "score_unique")}
-    ground_truth["cls"], predictions["cls"] = names[truth["cls"]], names[found["cls"]]
-    return ground_truth, predictions, frames
-
-
-@pytest.fixture(scope="session")
 def write_table():
     """Function (path, table, frames) that writes a table as .npz or .json records."""
 

@@ -9,11 +9,12 @@ from click.testing import CliRunner
 from radejax.cli.main import main
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import Boxes
-from radejax.data.dataset import LabelledFrame
+from radejax.data.kradar import KRadar
 from radejax.evaluation import boxes, files, kitti
 from radejax.evaluation.files import Source
 from radejax.evaluation.results import ReportOptions
 
+from ..data.conftest import write_kradar
 from .scenes import random_scene
 
 BOX = [20.0, 0, 0, 4, 2, 1.5, 0]
@@ -71,22 +72,6 @@ def test_frame_keys():
     assert boxes.frame_keys(named) == ["1/00033_00001", "12/00034_00002"]
     named["name"] = np.array(["1/00033_00001", "12/00034_00002"])
     assert boxes.frame_keys(named) == ["1/00033_00001", "12/00034_00002"]
-
-
-def test_tables_from_frames():
-    frame = LabelledFrame(
-        sequence=3,
-        name="00001_00001",
-        boxes=np.ones((2, 7)),
-        classes=np.array(["Sedan", "Bicycle"]),
-        weather="fog",
-    )
-    none = {"boxes": np.zeros((0, 7)), "classes": np.zeros(0, str)}
-    empty = dataclasses.replace(frame, **none, weather="rain")
-    truth, table = boxes.tables_from_frames([empty, frame])
-    assert truth.frame.tolist() == [1, 1]
-    assert truth.cls.tolist() == ["Sedan", "Bicycle"]
-    assert table["weather"].tolist() == ["rain", "fog"]
 
 
 # Boxes in files -----------------------------------------------------------------------
@@ -239,16 +224,16 @@ def test_a_part_of_the_frames(stored):
         assert set(table.frame) <= set(chosen.tolist())
 
 
-def test_labels_of_kradar(shared, tmp_path):
-    folder = shared / "data" / "kradar"
-    source = Source(labels=str(folder / "labels_v2_1.zip"), split="test")
-    first = (folder / "split" / "test.txt").read_text().splitlines()[0]
-    record = {**RECORD, "frame": first.replace(",", "/")}
+def test_labels_of_kradar(tmp_path):
+    write_kradar(tmp_path / "kradar")
+    record = {**RECORD, "frame": "2/00009_00006"}
     (tmp_path / "p.json").write_text(json.dumps([record]))
+    source = Source(labels=str(tmp_path / "kradar"), split="test")
     truth, found, frames, left_out = files.load(tmp_path / "p.json", source, ("Sedan",))
-    assert frames["frame"].size == 17536
-    assert found.frame.tolist() == [0]
-    assert len(truth) > 10000
+    data = KRadar(labels=tmp_path / "kradar", split="test")
+    assert found.frame.tolist() == [[x.key for x in data].index("2/00009_00006")]
+    assert frames["frame"].size == len(data) == 4
+    assert len(truth) == data.class_counts()["Sedan"]
     assert any(name.startswith("labels: ") for name in left_out)
 
 
@@ -295,16 +280,17 @@ def test_own_classes_need_no_option(stored, write_table):
     words = ["score", run / "found.json", "--ground-truth", run / "truth.json"]
     words += ["--out", run / "out", "--protocols", "all_point", "--json"]
     words = [str(word) for word in words]
-    done = CliRunner().invoke(main, words)
-    assert done.exit_code == 1
-    assert "unknown class 'Tram'" in done.stderr
+
+    def score(*more):
+        return CliRunner().invoke(main, [*words, *more])
+
+    done = score()
+    assert (done.exit_code, "unknown class 'Tram'" in done.stderr) == (1, True)
     (run / "config.json").write_text('{"classes": ["Tram"]}')
-    done = CliRunner().invoke(main, words)
-    assert done.exit_code == 0, done.stderr
-    row = next(row for row in json.loads(done.stdout)["ap"] if row["cls"] == "Tram")
+    row = next(x for x in json.loads(score().stdout)["ap"] if x["cls"] == "Tram")
     assert row["ap"] == 100
     # K-Radar's tools have no name for it, which keeps the report that was there.
-    done = CliRunner().invoke(main, [*words, "--kitti"])
+    done = score("--kitti")
     assert done.exit_code == 2
     assert "K-Radar's tools have no key for class 'Tram'" in done.stderr
     assert (run / "out" / "metrics.json").exists()

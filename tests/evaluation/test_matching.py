@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from radejax.evaluation import matching
-from radejax.geometry.rotated_iou import bev_iou, iou_3d
+from radejax.geometry.rotated_iou import bev_iou
 
 
 def boxes(rng, num):
@@ -30,27 +30,9 @@ def test_candidates_are_all_overlapping_pairs_of_a_group(monkeypatch, chunk):
     touching = set(zip(*np.nonzero((bev_iou(a, b) > 0) & is_same), strict=True))
     assert len(found) == first.size
     assert touching <= found < set(zip(*np.nonzero(is_same), strict=True))
-
-
-@pytest.mark.parametrize("counts", [(0, 0), (0, 1), (1, 0)])
-def test_no_candidates(counts):
-    group, box = zip(*((np.zeros(n), np.ones((n, 7))) for n in counts), strict=True)
-    assert [x.size for x in matching.candidate_pairs(*group, *box)] == [0, 0]
-
-
-def test_kradar_pair_fixture(shared):
-    folder = shared / "fixtures" / "kradar_eval"
-    pairs = np.load(folder / "pair_iou.npz")
-    truth = np.load(folder / "ground_truth.npz")["box_rounded"][pairs["gt_index"]]
-    found = np.load(folder / "predictions.npz")["box"][pairs["pred_index"]]
-    exchange = [0, 1, 2, 4, 3, 5, 6]
-    for columns, kind in ((slice(None), "geometric"), (exchange, "official")):
-        both = found[:, None, columns], truth[:, None, columns]
-        for iou, name in ((bev_iou, "bev"), (iou_3d, "iou3d")):
-            expected = pairs[f"{name}_{kind}"]
-            np.testing.assert_allclose(iou(*both)[:, 0, 0], expected, atol=1e-12)
-    legacy = iou_3d(*both, z_center=1.0)[:, 0, 0]
-    np.testing.assert_allclose(legacy, pairs["iou3d_official_legacy"], atol=1e-12)
+    for one, other in ((0, 0), (0, 1), (1, 0)):
+        few = group_a[:one], group_b[:other], a[:one], b[:other]
+        assert [x.size for x in matching.candidate_pairs(*few)] == [0, 0]
 
 
 def pairs(*triples):
@@ -73,7 +55,7 @@ def naive_greedy(claimant, target, preference, group):
     return sorted(chosen)
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(5))
 def test_greedy_equals_a_loop(seed):
     rng = np.random.default_rng(seed)
     num = 200
@@ -130,7 +112,7 @@ def second_pass_loop(pred, gt, iou, score, threshold):
 
 
 @pytest.mark.parametrize("chunk", [1, 7, 10**6])
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_second_pass_equals_a_loop_at_every_threshold(monkeypatch, seed, chunk):
     monkeypatch.setattr(matching, "PAIRS_PER_CHUNK", chunk)
     rng = np.random.default_rng(seed)
@@ -156,12 +138,6 @@ def test_best_and_free_differ():
     free = matching.match_free(chosen, score, np.zeros(2, int), 2, 0.3)
     assert best.tolist() == [0, -1]
     assert free.tolist() == [0, 1]
-
-
-def test_best_needs_the_threshold_of_the_best_one_only():
-    chosen = pairs((0, 0, 0.3), (0, 1, 0.3))
-    assert matching.match_best(chosen, np.array([0.9]), 0.3).tolist() == [-1]
-    assert matching.match_best(chosen, np.array([0.9]), 0.2).tolist() == [0]
 
 
 def test_higher_score_wins_and_first_row_breaks_ties():

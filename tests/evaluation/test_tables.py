@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from radejax.config import config_file, load_config, load_module
-from radejax.core.structures import CLASSES, NARROW_ROI, Boxes
-from radejax.data.kradar import KRadar
+from radejax.core.structures import CLASSES, NARROW_ROI
 from radejax.evaluation import report
-from radejax.evaluation.boxes import tables_from_frames
 from radejax.evaluation.report import PUBLISHED, RunTables
 from radejax.evaluation.results import ReportOptions, compute_results, make_set
 from radejax.runs.evaluate import report_options
+
+from .scenes import random_scene
 
 OF_PAPERS = [row for row in PUBLISHED if ", Table " in row.source]
 
@@ -147,21 +147,13 @@ AS_PAPERS = ReportOptions(
 )
 
 
-@pytest.fixture(scope="module")
-def real(shared):
-    """Ground truth and random predictions on the test split of K-Radar's labels v2.1."""
-    labels = shared / "data" / "kradar" / "labels_v2_1.zip"
-    truth, frames = tables_from_frames(KRadar(labels=labels, split="test"), "test")
-    rng = np.random.default_rng(5)
-    box = truth.box + rng.normal(0, 0.2, truth.box.shape) * [1, 1, 1, 0, 0, 0, 1]
-    score = rng.uniform(0.1, 1, len(box))
-    return truth, Boxes(truth.frame, box, truth.cls, score), frames
+SCENE = random_scene(9, num_frames=30, num_objects=150, num_classes=5)
 
 
-def _tables(real, split="test", **changes):
+def _tables(split="test", **changes):
     """Rows of Tables I, II, DinoRADE's 3, III and of other methods."""
     options = AS_PAPERS.replace(**changes)
-    results = compute_results(make_set(*real, options), real[2], options)
+    results = compute_results(make_set(*SCENE, options), SCENE[2], options)
     tables = RunTables("mine", {row.key: row for row in results}, options, split)
     return [table.rows for table in tables.papers()]
 
@@ -171,8 +163,8 @@ def _differences(rows):
     return [row[1:3] for row in rows if row[0] == "difference"]
 
 
-def test_a_difference_is_printed_where_protocol_labels_region_and_split_agree(real):
-    one, two, three, ablations, others = _tables(real)
+def test_a_difference_is_printed_where_protocol_labels_region_and_split_agree():
+    one, two, three, ablations, others = _tables()
     assert [cls for cls, _ in _differences(two)] == [
         "Sedan", "Sedan", "Bus or Truck", "Bus or Truck", "Pedestrian", "Pedestrian",
         "Motorcycle", "Bicycle", "Bicycle", "mean",
@@ -195,15 +187,15 @@ def test_a_difference_is_printed_where_protocol_labels_region_and_split_agree(re
         {"split": None},
     ],
 )
-def test_no_difference_is_printed_if_one_setting_differs(real, change):
-    for rows in _tables(real, **change)[1:3]:
+def test_no_difference_is_printed_if_one_setting_differs(change):
+    for rows in _tables(**change)[1:3]:
         assert _differences(rows) == []
         assert any("71.38" in row for row in rows)  # the published row remains
 
 
-def test_sedan_of_v1_1_is_compared_with_tables_1(real):
+def test_sedan_of_v1_1_is_compared_with_tables_1():
     # The flag stands for labels that are not available here.
-    rows = _tables(real, classes=("Sedan",), label_version="v1.1")[0]
+    rows = _tables(classes=("Sedan",), label_version="v1.1")[0]
     assert _differences(rows) == [
         ["3D", "RADE-Net, Table I"],
         ["3D", "DinoRADE, Table 1"],

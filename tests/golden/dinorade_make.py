@@ -20,6 +20,8 @@ import zlib
 import numpy as np
 
 SEED = 1234
+UNUSED = ("projected_value", "grad_projected_value", "initial_sampling_offsets_bias")
+UNUSED += ("grad_locations", "grad_weights", "grad_locations_reliable")
 
 
 def seeded_tensor(name: str, shape: tuple[int, ...]) -> np.ndarray:
@@ -122,23 +124,24 @@ def write_tiny_folder(folder: pathlib.Path) -> pathlib.Path:
 
 def main(fixtures: pathlib.Path, out: pathlib.Path) -> None:
     with np.load(fixtures / "dinov3" / "tiny.npz") as tiny:
-        keys = [f"64x96__{k}" for k in ("last_hidden_state", "embeddings")]
-        keys += ["64x96__after_layer_0", "64x96__rope_cos", "64x96__rope_sin"]
-        np.savez_compressed(
-            out / "dinorade_vit.npz",
-            **{k.removeprefix("64x96__"): tiny[k] for k in keys},
-        )
+        last = tiny["64x96__last_hidden_state"]
+        np.savez_compressed(out / "dinorade_vit.npz", last_hidden_state=last)
     info = json.loads((fixtures / "deform_attn" / "deform_attn.json").read_text())
     with np.load(fixtures / "deform_attn" / "deform_attn.npz") as file:
-        kept = ("core_two_levels", "module_two_levels", "module_box_reference")
-        arrays = {k: file[k] for k in file.files if k.split("__")[0] in kept}
+        kept = ("module_two_levels", "module_box_reference")
+        names = {k: k.split("__") for k in file.files}
+        arrays = {
+            k: file[k]
+            for k, name in names.items()
+            if name[0] in kept and name[-1] not in UNUSED
+        }
         info = {k: info[k] for k in kept}
         np.savez_compressed(
             out / "dinorade_deform_attn.npz", info=json.dumps(info), **arrays
         )
     with np.load(fixtures / "dinorade" / "geometry.npz") as file:
-        names = ("index", "reference_points_f64", "depth_f64", "pixel_unclamped_f64")
-        arrays = {k: file[k][::3] for k in (*names, "valid")}
+        names = ("index", "reference_points_f64", "valid")
+        arrays = {k: file[k][::3] for k in names}
     info = json.loads((fixtures / "dinorade" / "dinorade.json").read_text())["geometry"]
     np.savez_compressed(
         out / "dinorade_geometry.npz",

@@ -1,0 +1,157 @@
+"""AP that other code found: K-Radar's own, RADE-Net's own and a slow implementation."""
+
+import json
+
+import numpy as np
+import pytest
+
+from radejax.evaluation import EvaluationSet
+
+from .scenes import kradar_scene, random_scene
+
+VARIANTS = {
+    "kradar_r40": "revised",
+    "kradar_r11": "legacy",
+    "kradar_r40_corrected": "revised_yaw_corrected",
+}
+"""K-Radar's names of our protocols, in the order of the golden file."""
+METHODS = ("voc11", "recall41", "coco101", "auc")
+"""RADE-Net's protocols, in the order of the golden file."""
+
+
+def aps(results):
+    return np.array([result.ap for result in results])
+
+
+def test_k_radars_own_code_on_a_scene(golden):
+    """Which tests/golden/kradar_make.py ran; ties, crowds and empty frames are in the scene."""
+    expected = np.load(golden / "kradar_official.npz")
+    truth, found, frames = kradar_scene()
+    data = EvaluationSet(truth, found, frames=frames)
+    for v, protocol in enumerate(VARIANTS):
+        for c, cut in enumerate(expected["cuts"].tolist()):
+            for k, condition in enumerate(expected["conditions"].tolist()):
+                is_used = frames["weather"] == condition
+                results = data.results(
+                    protocol,
+                    iou_thresholds=expected["ious"].tolist(),
+                    score_threshold=cut,
+                    weights=None if condition == "all" else is_used,
+                )
+                ap = expected["ap"][v, c, k].ravel()
+                assert (ap > 0).any()
+                np.testing.assert_allclose(
+                    aps(results), ap, atol=1e-9, err_msg=f"{protocol} {condition} {cut}"
+                )
+                if (condition, cut) == ("all", 0):
+                    scores, precisions = (
+                        expected[name][v].reshape(-1, 41)
+                        for name in ("scores", "precision")
+                    )
+                    for one, score, precision in zip(
+                        results, scores, precisions, strict=True
+                    ):
+                        count = one.score.size
+                        np.testing.assert_allclose(one.score, score[:count], rtol=1e-6)
+                        np.testing.assert_allclose(
+                            one.precision, precision[:count], rtol=1e-6
+                        )
+                        assert not precision[count:].any()
+
+
+def test_radenets_own_code_on_a_scene(golden):
+    """Its IoU scales boxes by |(sin, cos)|."""
+    data = np.load(golden / "radenet_map.npz")
+    names = np.array(["Sedan", "Bus or Truck", "Pedestrian"])
+    pred = data["pred"].astype(np.float64)
+    norm = np.hypot(pred[:, 6], pred[:, 7])[:, None]
+    yaw = np.arctan2(pred[:, 6], pred[:, 7])[:, None]
+    box = np.hstack([pred[:, :3], pred[:, 3:5] * norm, pred[:, 5:6], yaw])
+    found = {"frame": data["pred_frame"], "box": box, "score": pred[:, 8]}
+    found["cls"] = names[pred[:, 9].astype(int)]
+    box = data["gt_values"][:, [0, 1, 2, 4, 5, 6, 3]]
+    truth = {"frame": data["gt_frame"], "box": box, "cls": names[data["gt_class"]]}
+    selections = (
+        np.arange(80),
+        np.arange(9),
+        np.setdiff1d(np.arange(80), truth["frame"])[:3],
+    )
+    for chosen, of_selection in zip(selections, data["ap"], strict=True):
+        part = [
+            {k: v[np.isin(table["frame"], chosen)] for k, v in table.items()}
+            for table in (truth, found)
+        ]
+        for r, roi in enumerate(("narrow", "wide")):
+            shared_set = EvaluationSet(*part, classes=names.tolist(), roi=roi)
+            for s, empty_frames in enumerate(("class", "none")):
+                for m, protocol in enumerate(METHODS):
+                    results = shared_set.results(
+                        protocol, iou_thresholds=(0.3, 0.5), empty_frames=empty_frames
+                    )
+                    expected = of_selection[:, :, r, s, m].ravel()
+                    found_aps = np.where(
+                        [x.is_defined for x in results], aps(results), 0
+                    )
+                    np.testing.assert_allclose(
+                        found_aps / 100, np.nan_to_num(expected), atol=1e-9
+                    )
+                    is_defined = [x.is_defined for x in results]
+                    np.testing.assert_array_equal(is_defined, np.isfinite(expected))
+
+
+def test_a_slow_implementation_on_three_scenes(golden):
+    """Loops over frames, boxes and thresholds, with shapely, wrote the golden file.
+
+    They were tests/evaluation/reference.py up to version 0.3.
+    """
+    data = np.load(golden / "evaluation_scenes.npz")
+    ious, cuts = data["ious"].tolist(), data["cuts"].tolist()
+    for scene, expected in enumerate(data["ap"]):
+        truth, found, frames = random_scene(
+            101 + scene, num_frames=40, num_objects=120, num_classes=3, ties=scene != 1
+        )
+        classes = data["classes"].tolist()
+        shared_set = EvaluationSet(truth, found, classes=classes, frames=frames)
+        for p, protocol in enumerate(data["protocols"].tolist()):
+            for c, cut in enumerate(cuts):
+                results = shared_set.results(
+                    protocol, iou_thresholds=ious, score_threshold=cut
+                )
+                np.testing.assert_allclose(
+                    aps(results), expected[p, c].ravel(), atol=1e-9, err_msg=protocol
+                )
+
+
+def test_k_radars_own_code_on_real_labels(shared):
+    folder = shared / "fixtures" / "kradar_eval"
+    expected = json.loads((folder / "expected_ap.json").read_text())
+    truth, found = (
+        np.load(folder / f"{name}.npz") for name in ("ground_truth", "predictions")
+    )
+    names, weather = truth["class_names"], truth["frame_weather"]
+    columns = [
+        {k: table[k] for k in ("frame", "box", "score") if k in table}
+        | {"cls": names[table["cls"]]}
+        for table in (truth, found)
+    ]
+    data = EvaluationSet(*columns, frames={"frame": np.arange(weather.size)})
+    keys = {name: key for key, name in expected["classes"].items()}
+    checked = 0
+    for protocol, variant in VARIANTS.items():
+        for cut in (0.0, 0.3):
+            listed = expected["variants"][variant][f"conf_{cut}"]
+            for condition, numbers in listed.items():
+                for result in data.results(
+                    protocol,
+                    iou_thresholds=expected["iou_thresholds"],
+                    score_threshold=cut,
+                    weights=None if condition == "all" else weather == condition,
+                ):
+                    entry = numbers["classes"][keys[result.cls]]
+                    assert result.num_frames == numbers["num_frames"]
+                    assert result.num_gt == entry["num_gt"]
+                    assert result.num_det == entry["num_det"]
+                    ap = entry[result.space][str(result.iou)]
+                    assert result.ap == pytest.approx(ap, abs=1e-9)
+                    checked += 1
+    assert checked == 3 * 2 * 8 * 2 * 3 * 5
