@@ -93,9 +93,6 @@ def test_errors_of_the_file_system_are_not_corruption(tmp_path):
         read_npy(tmp_path / "none.npy")
     with pytest.raises(IsADirectoryError):
         read_npz(tmp_path)
-
-
-def test_a_disk_that_does_not_answer_is_no_corruption(tmp_path):
     with (
         pytest.raises(OSError, match=r"Input/output error: 'a\.mat'"),
         wrap_read_errors("a.mat", "a MATLAB file"),

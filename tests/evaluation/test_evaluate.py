@@ -154,7 +154,6 @@ def test_region_and_classes_filter_both_sides_and_are_in_the_name(roi):
     inside, outside = car(72.0, 6.4), car(72.1)  # the bounds belong to the region
     truth = truth_of((0, inside, "Sedan"), (0, outside, "Sedan"), group)
     found = found_of(inside, car(20, -6.5), (0, car(), "Bicycle", 0.9))
-    terms = {"score_threshold": 0.3, "label_version": "v2.1"}
     data = EvaluationSet(truth, found, classes=["Sedan"], roi=roi, label_version="v2.1")
     assert (len(data.gt), len(data.pred)) == (1, 1)
     assert data.left_out == {
