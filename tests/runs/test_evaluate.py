@@ -2,9 +2,11 @@
 
 import dataclasses
 import pathlib
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -64,8 +66,9 @@ def test_a_cut_when_scoring_is_a_cut_when_decoding() -> None:
     )
 
     def columns(score: float) -> dict[str, np.ndarray]:
-        options = DecodeOptions(max_detections=60, score_threshold=score)
-        return decode(maps, grid, options).to_boxes().columns()
+        options = DecodeOptions(max_detections=30, score_threshold=score)
+        decoded = jax.jit(lambda x: decode(x, grid, options))(maps)
+        return decoded.to_boxes().columns()
 
     low, high = columns(0.05), columns(0.3)
     assert len(low["score"]) > len(high["score"]) > 10
@@ -95,79 +98,57 @@ def test_changes_replace_what_the_config_says() -> None:
         report_options(Config(), classes=("Tram",))
 
 
+@pytest.fixture
+def evaluated(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., dict[str, Any]]:
+    """Function from options to what is written of a run that is not there."""
+
+    def run(choosing: str, **options: Any) -> dict[str, Any]:
+        written: dict[str, Any] = {}
+        data = SimpleNamespace(choosing_split=choosing, preprocess=lambda: None)
+        loaded = SimpleNamespace(config=Config(), run="run", variables=None, step=3)
+        evaluation = SimpleNamespace(report=lambda *_, **named: written.update(named))
+        monkeypatch.setattr(evaluate, "load_model", lambda *_, **__: loaded)
+        monkeypatch.setattr(evaluate, "data_of_run", lambda *_: (loaded.config, data))
+        monkeypatch.setattr(evaluate, "Evaluation", lambda *_, **__: evaluation)
+        evaluate.evaluate_run(tmp_path, **options)
+        return written
+
+    return run
+
+
 @pytest.mark.parametrize(
-    ("choosing", "split", "step", "folder", "remark"),
+    ("choosing", "options", "folder", "remark"),
     [
+        ("test", {"step": "best"}, "_checkpoint_best", "chosen on the test split"),
+        ("test", {}, "", ""),
+        ("validation", {"step": "best"}, "_checkpoint_best", ""),
+        ("validation", {"split": "validation"}, "_validation", ""),
         (
-            "test",
-            "test",
-            "best",
-            "evaluation_checkpoint_best",
-            "chosen on the test split",
-        ),
-        ("test", "test", None, "evaluation", ""),
-        ("validation", "test", "best", "evaluation_checkpoint_best", ""),
-        ("validation", "validation", None, "evaluation_validation", ""),
-        (
-            *("validation", "all", "best", "evaluation_all_checkpoint_best"),
+            *("validation", {"split": "all", "step": "best"}, "_all_checkpoint_best"),
             "chosen on the validation split",
         ),
+        ("test", {"bootstrap": 7, "figures": "pdf", "min_score": 0.05}, "", ""),
+        ("test", {"roi": "wide", "step": 70}, "_checkpoint_70_roi_wide", ""),
+        ("test", {"roi": None}, "_roi_None", ""),
+        ("test", {"split": "lists/fog.txt"}, "_fog", ""),
+        ("test", {"out": "elsewhere", "roi": "wide"}, None, ""),
     ],
 )
-def test_numbers_on_what_chose_the_checkpoint_are_marked(
+def test_folder_and_remark_follow_the_options(
     choosing: str,
-    split: str,
-    step: str | None,
-    folder: str,
+    options: dict[str, Any],
+    folder: str | None,
     remark: str,
+    evaluated: Callable[..., dict[str, Any]],
     tmp_path: pathlib.Path,
-    monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    written: dict[str, Any] = {}
-    data = SimpleNamespace(choosing_split=choosing, preprocess=lambda: None)
-    saved = {"run": "run", "variables": None, "step": 3}
-    loaded = SimpleNamespace(config=Config(), **saved)
-    monkeypatch.setattr(evaluate, "load_model", lambda *_, **__: loaded)
-    monkeypatch.setattr(evaluate, "data_of_run", lambda *_: (loaded.config, data))
-    evaluation = SimpleNamespace(report=lambda *_, **named: written.update(named))
-    monkeypatch.setattr(evaluate, "Evaluation", lambda *_, **__: evaluation)
-    evaluate.evaluate_run(tmp_path, step=step, split=split)
-    assert written["out"] == tmp_path / folder
+    """Numbers on the frames that chose the checkpoint are marked."""
+    written = evaluated(choosing, **options)
+    expected = options["out"] if folder is None else tmp_path / f"evaluation{folder}"
+    assert pathlib.Path(written["out"]) == pathlib.Path(expected)
     name = f"{tmp_path.name} ({remark})" if remark else tmp_path.name
     assert written["run"] == name
     assert ("may not be reported" in caplog.text) == bool(remark)
-
-
-@pytest.mark.parametrize(
-    ("changes", "folder"),
-    [
-        ({}, "evaluation"),
-        ({"bootstrap": 7, "figures": "pdf", "min_score": 0.05}, "evaluation"),
-        ({"roi": "wide", "step": 70}, "evaluation_checkpoint_70_roi_wide"),
-        ({"roi": None}, "evaluation_roi_None"),
-        (
-            {"classes": ("Sedan", "Bus or Truck"), "score_threshold": 0.1},
-            "evaluation_classes_Sedan_Bus-or-Truck_score_threshold_0.1",
-        ),
-        ({"split": "lists/fog.txt"}, "evaluation_fog"),
-        ({"out": "elsewhere", "roi": "wide"}, "elsewhere"),
-    ],
-)
-def test_other_options_have_another_folder(
-    changes: dict[str, Any],
-    folder: str,
-    tmp_path: pathlib.Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    written: list[pathlib.Path] = []
-    data = SimpleNamespace(choosing_split="test", preprocess=lambda: None)
-    loaded = SimpleNamespace(config=Config(), run="run", variables=None, step=3)
-    monkeypatch.setattr(evaluate, "load_model", lambda *_, **__: loaded)
-    monkeypatch.setattr(evaluate, "data_of_run", lambda *_: (loaded.config, data))
-    evaluation = SimpleNamespace(report=lambda *_, out, **__: written.append(out))
-    monkeypatch.setattr(evaluate, "Evaluation", lambda *_, **__: evaluation)
-    if "out" in changes:
-        changes = {**changes, "out": tmp_path / changes["out"]}
-    evaluate.evaluate_run(tmp_path, **changes)
-    assert written == [tmp_path / folder]

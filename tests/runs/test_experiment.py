@@ -15,7 +15,6 @@ from radejax.core.errors import UserError
 from radejax.data.kradar import dataset
 from radejax.inference.detect_files import detect_files, find_inputs
 from radejax.inference.detector import Detector
-from radejax.inference.saved import load_model
 from radejax.runs import evaluate, experiment
 from radejax.runs.experiment import claimed
 from radejax.simulation.config import SimulationOptions
@@ -23,17 +22,6 @@ from radejax.simulation.dataset import simulate_dataset
 from radejax.training.checkpoints import Checkpoints
 
 from .. import small_models as small
-
-
-def _small_run(folder: pathlib.Path, **simulation: Any) -> Config:
-    """Config of a run of seconds on data that are simulated in a folder."""
-    return small.shrink_run(load_config("quickstart:short")).replace(
-        simulation={"output": "projection", **simulation},
-        data={"roots": (str(folder / "data"),)},
-        model={"cbam": "off", "widths": (8,)},
-        train={"num_epochs": 1},
-        evaluation={"num_visualizations": 0},
-    )
 
 
 def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
@@ -81,13 +69,16 @@ def test_frames_and_frozen_weights_tell_whether_a_run_is_the_same() -> None:
     assert stays(["1/a"], "0" * 64) != stays(["1/a"], "1" * 64)
 
 
-def test_labels_are_read_once(
+def test_a_run_of_two_frames(
     tmp_path: pathlib.Path,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
     one_device: Mesh,
 ) -> None:
-    """And the sequences that are held out choose the best checkpoint."""
+    """Training, choice of a checkpoint on a held-out sequence, evaluation and detection.
+
+    Labels are read once, and weights fit models of two frames only.
+    """
     parsed: collections.Counter = collections.Counter()
     read = dataset.read_label_file
 
@@ -95,56 +86,52 @@ def test_labels_are_read_once(
         parsed[path] += 1
         return read(path, version, **options)
 
-    monkeypatch.setattr(dataset, "read_label_file", count)
-    config = _small_run(tmp_path, train_sequences=3, frames_per_sequence=2).replace(
-        data={"validation": (2,)}, train={"evaluate_every_epochs": 1}
-    )
     evaluated = []
     make = evaluate.tables_from_frames
-    monkeypatch.setattr(
-        evaluate,
-        "tables_from_frames",
-        lambda f, split: evaluated.append([x.sequence for x in f]) or make(f, split),
+
+    def tables(frames: Any, split: str) -> Any:
+        evaluated.append([frame.sequence for frame in frames])
+        return make(frames, split)
+
+    monkeypatch.setattr(dataset, "read_label_file", count)
+    monkeypatch.setattr(evaluate, "tables_from_frames", tables)
+    config = small.shrink_run(load_config("quickstart:short")).replace(
+        simulation={"output": "projection", "train_sequences": 3},
+        data={"roots": (str(tmp_path / "data"),), "validation": (2,), "num_frames": 2},
+        model={"cbam": "off", "widths": (8,), "input_stem": True},
+        train={"num_epochs": 1, "evaluate_every_epochs": 1},
+        evaluation={"num_visualizations": 0},
     )
+    config = config.replace(simulation={"frames_per_sequence": 2})
     with caplog.at_level("INFO", "radejax"):
         folder = experiment.run(config, tmp_path / "run", mesh=one_device)
     assert evaluated == [[2, 2], [4, 4]]
+    assert (len(parsed), set(parsed.values())) == (8, {1})
+    for text in (
+        "2 of 4 samples of 2 frames repeat one",
+        "1 of 2 samples of 2 frames repeat one",
+        "Best checkpoint, chosen on the validation split: ",
+    ):
+        assert text in caplog.text
     (events,) = (folder / "tensorboard").glob("*.test")
     assert b"test/map_3d_iou30/coco101/" in events.read_bytes()
     frames = json.loads((folder / "evaluation" / "frames.json").read_text())
     assert (frames["sequence"], frames["split"]) == ([4, 4], ["test", "test"])
-    assert "Best checkpoint, chosen on the validation split: " in caplog.text
     with Checkpoints(folder / "checkpoints", read_only=True) as checkpoints:
-        _, info, _ = checkpoints.restore_variables()
-        assert info["same"]["frames to train on"] == 4
-    assert len(parsed) == 8
-    assert set(parsed.values()) == {1}
-
-
-def test_a_run_of_two_frames(
-    tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture, one_device: Mesh
-) -> None:
-    """Training, evaluation and detection; weights fit models of two frames only."""
-    config = _small_run(tmp_path, train_sequences=2, frames_per_sequence=3).replace(
-        data={"num_frames": 2}, model={"input_stem": True}
-    )
-    with caplog.at_level("INFO", "radejax"):
-        folder = experiment.run(config, tmp_path / "run", mesh=one_device)
-    assert "2 of 6 samples of 2 frames repeat one" in caplog.text
-    assert "1 of 3 samples of 2 frames repeat one" in caplog.text
-    saved = load_model(folder)
-    kernel = saved.variables["params"]["backbone"]["stem"]["doppler"]["conv"]["kernel"]
+        variables, info, _ = checkpoints.restore_variables()
+    assert info["same"]["frames to train on"] == 4
+    kernel = variables["params"]["backbone"]["stem"]["doppler"]["conv"]["kernel"]
     assert kernel.shape[-2] == 2 * 4
-    assert len(list((tmp_path / "data" / "records").glob("*/*.npy"))) == 9
     root, out = tmp_path / "data", tmp_path / "boxes"
-    detector = Detector.from_workdir(folder, score_threshold=0.0)
-    count, _ = detect_files(detector, find_inputs(detector, [root]), out)
-    assert (count["frames"], count["repeated"]) == (9, 3)
+    assert len(list((root / "records").glob("*/*.npy"))) == 8
+    detector = Detector.from_workdir(folder, score_threshold=0.0, batch_sizes=(8,))
+    count = detect_files(detector, find_inputs(detector, [root]), out)
+    assert (count["frames"], count["repeated"]) == (8, 4)
     one = config.replace(data={"num_frames": 1})
     with pytest.raises(UserError, match=r"run do not fit config.model .*stem/doppler"):
         experiment.run(one, tmp_path / "one", init_from=folder, mesh=one_device)
     single = config.replace(
-        data={"roots": (str(tmp_path / "single"),)},
+        data={"roots": (str(tmp_path / "single"),), "validation": ()},
         simulation={"train_sequences": 4, "frames_per_sequence": 1},
     )
     with pytest.raises(UserError, match=r"num_frames is 2, expected 1, as no frame to"):
@@ -259,9 +246,6 @@ def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
         assert "54.00 ± 4.58" in table
     assert "all_point, score>0.05" in text
     assert "rain" not in text
-
-
-def test_seeds_are_different(tmp_path: pathlib.Path) -> None:
     message = r"--seeds is \(1, 2, 1\), expected different seeds"
     with pytest.raises(UserError, match=message):
         experiment.run_seeds(Config(), tmp_path, (1, 2, 1))

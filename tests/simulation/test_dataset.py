@@ -9,6 +9,7 @@ import sys
 
 import numpy as np
 import pytest
+import scipy.io
 from PIL import Image
 
 from radejax import Detector, models
@@ -64,26 +65,19 @@ def tree(tmp_path_factory):
 class TestTree:
     def test_reads_as_kradar_without_a_problem(self, tree):
         data = KRadar(tree, split="train")
-        assert len(data) == 6
-        assert data.grid.shape_drea == (8, 32, 5, 24)
-        assert len(KRadar(tree, split="test")) == 3
+        assert (len(data), len(KRadar(tree, split="test"))) == (6, 3)
         frame = data[0]
-        assert frame.tesseract_path.is_file()
         conditions = frame.environment, frame.time, frame.weather
         assert conditions == ("urban", "day", "normal")
         assert np.asarray(Image.open(frame.camera_path)).shape == (36, 128, 3)
-
-    def test_tesseract_has_kradars_variable_axes_and_level(self, tree):
-        import scipy.io
-
-        path = KRadar(tree)[0].tesseract_path
-        power = scipy.io.loadmat(path)["arrDREA"]
-        assert power.shape == (8, 32, 5, 24)
+        power = scipy.io.loadmat(frame.tesseract_path)["arrDREA"]
+        assert power.shape == data.grid.shape_drea == (8, 32, 5, 24)
         assert power.dtype == np.float32
         normalized = (10.0 * np.log10(power + 1e-10) + 1.2) / 184.3
-        assert normalized.min() >= 0.0
-        assert normalized.max() <= 1.0
+        assert 0.0 <= normalized.min() < normalized.max() <= 1.0
         assert 0.45 < np.median(normalized) < 0.6  # the noise floor
+        labels = [x for f in KRadar(tree, visibility=None) for x in f.labels]
+        assert {label.visibility for label in labels} == {"R", "L"}
 
     def test_a_model_sees_through_the_cameras_that_drew_the_images(self, tree):
         cameras = camera_inputs(KRadar(tree)[:1], (36, 64), CameraOptions()).cameras
@@ -113,11 +107,6 @@ class TestTree:
             assert a.cls == b.cls
             np.testing.assert_allclose(a.box[3:6], b.box[3:6])
             assert np.hypot(a.box[0] - b.box[0], a.box[1] - b.box[1]) < 6.0
-
-    def test_both_visibilities_occur(self, tree):
-        labels = (f.labels for f in KRadar(tree, visibility=None))
-        assert {label.visibility for group in labels for label in group} == {"R", "L"}
-
 
 class TestRepeating:
     def test_same_seed_same_bytes_by_worker_processes(self, tree, tmp_path):
@@ -199,14 +188,15 @@ class TestWrongUse:
             simulate_dataset(small_config(), tmp_path / "full", progress=False)
 
 
-@pytest.mark.parametrize("output", ["tesseract", "projection"])
-def test_expected_size_is_that_of_the_files(output, tmp_path):
-    config = small_config(output=output, train_sequences=1, frames_per_sequence=1)
-    num_frames, expected = dataset.expected_size(config, make_source(config))
-    root = simulate_dataset(config, tmp_path / "data", progress=False)
-    files = [p for p in root.rglob("*") if p.suffix in (".mat", ".npy", ".png")]
-    assert num_frames == 2
-    assert expected == pytest.approx(sum(p.stat().st_size for p in files), rel=0.2)
+def test_expected_size_is_that_of_the_files(tree, tmp_path):
+    changes = {"output": "projection", "train_sequences": 1, "frames_per_sequence": 1}
+    projected = small_config(**changes)
+    root = simulate_dataset(projected, tmp_path / "data", progress=False)
+    for config, place, count in ((small_config(), tree, 9), (projected, root, 2)):
+        num_frames, expected = dataset.expected_size(config, make_source(config))
+        files = [p for p in place.rglob("*") if p.suffix in (".mat", ".npy", ".png")]
+        assert num_frames == count
+        assert expected == pytest.approx(sum(p.stat().st_size for p in files), rel=0.2)
 
 
 def test_a_sensor_without_elevation_is_a_kradar_tree_without_its_channels(tmp_path):
@@ -225,18 +215,14 @@ def test_a_sensor_without_elevation_is_a_kradar_tree_without_its_channels(tmp_pa
     np.testing.assert_array_equal(projection, project_tensor(power)[..., :4])
     # As the input of a detector, the tensor gives what its projection gives.
     config = small.radar_config().replace(
-        model={"doppler_bins": 4, "elevation_bins": 0}
+        model={"doppler_bins": 4, "elevation_bins": 0}, data={"num_frames": 2}
     )
-    variables = small.drawn(models.build(config.model), projection[None])
-    detector = Detector(SavedModel(config, grid, variables), score_threshold=0.0)
-    by_power, by_projection = detector(power), detector(projection)
-    np.testing.assert_allclose(by_power.scores, by_projection.scores, atol=1e-3)
-    assert by_power.is_valid.any()
-    config = config.replace(data={"num_frames": 2})
     stacked = np.tile(projection, 2)[None]
     variables = small.drawn(models.build(config.model, 2), stacked)
-    several = Detector(SavedModel(config, grid, variables), score_threshold=0.0)
-    by_powers, by_projections = several([power] * 2), several([projection] * 2)
+    saved = SavedModel(config, grid, variables)
+    detector = Detector(saved, batch_sizes=(1,), score_threshold=0.0)
+    by_powers, by_projections = detector([power] * 2), detector([projection] * 2)
     np.testing.assert_allclose(by_powers.scores, by_projections.scores, atol=1e-3)
-    again = detector(str(frames[0].radar_path))
-    np.testing.assert_array_equal(again.boxes, by_projection.boxes)
+    assert by_powers.is_valid.any()
+    again = detector([str(frames[0].radar_path)] * 2)
+    np.testing.assert_array_equal(again.boxes, by_projections.boxes)
