@@ -168,18 +168,12 @@ def test_score_evaluates_predictions_in_files(tmp_path: pathlib.Path) -> None:
     found = {**truth, "score": np.array([0.9, 0.8])}
     kitti.write_kitti(tmp_path / "kitti", truth, found, {"frame": np.arange(2)})
     arguments = ("score", tmp_path / "kitti", "--out", tmp_path / "out")
-    text = _run(*arguments)
-    assert text.exit_code == 0, text.output
-    assert "100.0" in text.output
+    assert json.loads(_run(*arguments, "--json").stdout)["num_ground_truth"] == 2
     assert (tmp_path / "out" / "metrics.json").is_file()
-    assert json.loads(_run(*arguments, "--json").stdout)
-    for words, end in (
-        ((), ""),
-        (("--roi", "wide", "--bootstrap", 0), "_roi_wide"),
-        (("--z-offset", "0.5"), "_z_offset_m_0.5"),
-    ):
-        text = _run("score", tmp_path / "kitti", *words).output
-        assert text.endswith(f"Written to {tmp_path / 'kitti_evaluation'}{end}\n")
+    words = ("--roi", "wide", "--bootstrap", 0, "--z-offset", "0.5")
+    place = f"{tmp_path / 'kitti_evaluation'}_roi_wide_z_offset_m_0.5"
+    text = _run("score", tmp_path / "kitti", *words).output
+    assert text.endswith(f"Written to {place}\n")
 
 
 def test_simulate_works_anywhere(

@@ -108,6 +108,7 @@ class TestTree:
             np.testing.assert_allclose(a.box[3:6], b.box[3:6])
             assert np.hypot(a.box[0] - b.box[0], a.box[1] - b.box[1]) < 6.0
 
+
 class TestRepeating:
     def test_same_seed_same_bytes_by_worker_processes(self, tree, tmp_path):
         again = simulate_dataset(
