@@ -1,6 +1,6 @@
 """Readers on corrupted inputs: a child process reads them, and its parent counts outcomes.
 
-A crash or hang ends only the child. The parent notes the input and starts another child.
+A crash or hang ends only the child, and the parent notes the input.
 Input number n of a reader is made of `Random(f"{reader}/{n}")`, so that it is the same in
 every process.
 """
@@ -17,7 +17,7 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import NamedTuple
 
 from .mutate import mutate
@@ -51,7 +51,7 @@ class Reader(NamedTuple):
     make: Callable[[pathlib.Path], object]
     read: Callable[[pathlib.Path], object]
     pattern: str
-    count: int = 200
+    count: int = 100
 
 
 class Case:
@@ -130,57 +130,44 @@ def serve(jobs: list[Job]) -> None:
             resource.setrlimit(resource.RLIMIT_DATA, (resource.RLIM_INFINITY,) * 2)
 
 
-def run(jobs: list[Job]) -> Iterator[Outcome]:
-    """Yield the outcomes of inputs, in order."""
-    jobs = list(jobs)
-    while jobs:
-        command = [sys.executable, "-X", "faulthandler", "-c"]
-        command += [f"from tests.fuzz.engine import serve; serve({jobs!r})"]
-        path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
-        env = {**os.environ, "PYTHONPATH": path, "JAX_PLATFORMS": "cpu"}
-        with (
-            tempfile.TemporaryFile() as stderr,
-            subprocess.Popen(
-                command, cwd=ROOT, env=env, stdout=subprocess.PIPE, stderr=stderr
-            ) as child,
-        ):
-            for outcome in _outcomes(child):
-                yield outcome
-                _advance(jobs)
-            if jobs:
-                kind = "hang" if child.poll() is None else f"crash: {child.returncode}"
+def run(jobs: list[Job]) -> list[Outcome]:
+    """Return the outcomes of inputs in order, up to a crash or hang of the child."""
+    command = [sys.executable, "-X", "faulthandler", "-c"]
+    command += [f"from tests.fuzz.engine import serve; serve({jobs!r})"]
+    path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+    env = {**os.environ, "PYTHONPATH": path, "JAX_PLATFORMS": "cpu"}
+    output, wrong = b"", ""
+    with (
+        tempfile.TemporaryFile() as stderr,
+        subprocess.Popen(
+            command, cwd=ROOT, env=env, stdout=subprocess.PIPE, stderr=stderr
+        ) as child,
+    ):
+        assert child.stdout is not None
+        while not wrong:
+            if not select.select([child.stdout], [], [], MAX_SECONDS)[0]:
                 child.kill()
-                stderr.seek(0)
-                text = stderr.read().decode(errors="replace")[-3000:]
-                yield jobs[0][0], jobs[0][1], kind, text
-                _advance(jobs)
-
-
-def _advance(jobs: list[Job]) -> None:
-    """Remove the first input."""
-    name, start, count = jobs.pop(0)
-    if count > 1:
-        jobs.insert(0, (name, start + 1, count - 1))
-
-
-def _outcomes(child: subprocess.Popen) -> Iterator[Outcome]:
-    """Outcomes that the child writes until it ends or hangs."""
-    assert child.stdout is not None
-    text = b""
-    while select.select([child.stdout], [], [], MAX_SECONDS)[0]:
-        data = os.read(child.stdout.fileno(), 1 << 16)
-        if not data:
-            child.wait()
-            return
-        *lines, text = (text + data).split(b"\x1e")
-        for line in lines:
-            name, found, kind, message = line.decode(errors="replace").split("\x1f", 3)
-            yield name, int(found), kind, message
+                wrong = "hang"
+            elif data := os.read(child.stdout.fileno(), 1 << 16):
+                output += data
+            else:
+                wrong = f"crash: {child.wait()}"
+        stderr.seek(0)
+        text = stderr.read().decode(errors="replace")[-3000:]
+    lines = output.decode(errors="replace").split("\x1e")[:-1]
+    parts = [line.split("\x1f", 3) for line in lines]
+    found = [(name, int(number), kind, text) for name, number, kind, text in parts]
+    inputs = [
+        (name, n) for name, start, count in jobs for n in range(start, start + count)
+    ]
+    if len(found) < len(inputs):
+        found.append((*inputs[len(found)], wrong, text))
+    return found
 
 
 def counts(jobs: list[Job]) -> dict[str, tuple[collections.Counter, list[Outcome]]]:
     """By reader, the number of outcomes of each kind, and the wrong outcomes."""
-    outcomes = list(run(jobs))
+    outcomes = run(jobs)
     found = {}
     for name, _, _ in jobs:
         own = [outcome for outcome in outcomes if outcome[0] == name]

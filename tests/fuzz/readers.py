@@ -105,14 +105,14 @@ READERS = {
     for version in labels.VERSIONS
 }
 READERS |= {
-    "label zip": Reader(_label_zip, _read_label_zip, "*.zip", 100),
+    "label zip": Reader(_label_zip, _read_label_zip, "*.zip", 60),
     "split": _of_root(folders.read_split, "split/train.txt"),
     "calibration": _of_root(
         folders.read_calibration, "1/info_calib/calib_radar_lidar.txt"
     ),
     "description": _of_root(conditions.read_description, "1/description.txt"),
     "camera yml": _of_root(_camera, "1/cam_1.yml"),
-    "dataset": Reader(_root, _read_root, "**/*.txt", 100),
+    "dataset": Reader(_root, _read_root, "**/*.txt", 50),
     "projection npy": Reader(
         functools.partial(_tensor, kind="plain"),
         lambda folder: read_projection_npy(folder / "a.npy"),
