@@ -114,28 +114,22 @@ def test_left_half_of_the_stereo_pair(tmp_path):
     pixels = np.random.default_rng(0).integers(
         0, 255, (height, 2 * width, 3), dtype=np.uint8
     )
-    Image.fromarray(pixels).save(tmp_path / "a.png", compress_level=1)
-    np.testing.assert_array_equal(
-        read_left_image(tmp_path / "a.png"), pixels[:, :width]
-    )
-    Image.fromarray(pixels[:, :width]).save(tmp_path / "b.png", compress_level=1)
-    np.testing.assert_array_equal(
-        read_left_image(tmp_path / "b.png"), pixels[:, :width]
-    )
-    Image.fromarray(pixels[:50, :70]).save(tmp_path / "c.png")
-    with pytest.raises(DataError, match=r"c\.png: 70 x 50 pixels, expected 2560 x 720"):
-        read_left_image(tmp_path / "c.png")
-    content = (tmp_path / "a.png").read_bytes()
-    (tmp_path / "a.png").write_bytes(content[: len(content) // 2])
+    path = tmp_path / "a.png"
+    for shown in (pixels[:, :width], pixels):
+        Image.fromarray(shown).save(path, compress_level=1)
+        np.testing.assert_array_equal(read_left_image(path), pixels[:, :width])
+    content = path.read_bytes()
+    for damaged in (content[: len(content) // 2], b"no image"):
+        path.write_bytes(damaged)
+        with pytest.raises(DataError, match=r"a\.png: corrupted"):
+            read_left_image(path)
+    Image.fromarray(pixels[:50, :70]).save(path)
+    with pytest.raises(DataError, match=r"a\.png: 70 x 50 pixels, expected 2560 x 720"):
+        read_left_image(path)
+    Image.new("L", (4, 4)).save(path)
+    path.write_bytes(path.read_bytes()[:44])
     with pytest.raises(DataError, match=r"a\.png: corrupted"):
-        read_left_image(tmp_path / "a.png")
-    (tmp_path / "a.png").write_bytes(b"no image")
-    with pytest.raises(DataError, match=r"a\.png: corrupted"):
-        read_left_image(tmp_path / "a.png")
-    Image.new("L", (4, 4)).save(tmp_path / "a.png")
-    (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:44])
-    with pytest.raises(DataError, match=r"a\.png: corrupted"):
-        read_left_image(tmp_path / "a.png", resize=True)
+        read_left_image(path, resize=True)
 
 
 def test_gray_levels_of_16_bits_are_divided_by_256(tmp_path):

@@ -49,11 +49,8 @@ def test_points_are_where_the_echoes_are():
     np.testing.assert_allclose(azimuth_rad, GRID.azimuth_rad[[40, 10]])
     elevation_rad = np.arcsin(points.z_m / GRID.range_m[[30, 50]])
     np.testing.assert_allclose(elevation_rad, GRID.elevation_rad[[4, 0]])
-
-
-def test_a_constant_map_has_no_points():
-    points = cfar_points(np.full(GRID.projection_shape, 0.5, np.float32), GRID)
-    assert [column.shape for column in points] == [(0,)] * 8
+    constant = np.full(GRID.projection_shape, 0.5, np.float32)
+    assert [column.shape for column in cfar_points(constant, GRID)] == [(0,)] * 8
 
 
 @pytest.mark.parametrize("absent", ["elevation_rad", "doppler_mps"])
@@ -217,12 +214,8 @@ def test_points_are_written_in_three_formats(tmp_path, count):
     header, _, body = (tmp_path / "points.pcd").read_bytes().partition(b"DATA binary\n")
     lines = dict(line.split(" ", 1) for line in header.decode().splitlines())
     assert lines["FIELDS"].split() == list(POINT_FIELDS)
-    assert lines["SIZE"].split() == ["4"] * 11
-    assert lines["TYPE"].split() == ["F"] * 11
-    assert lines["COUNT"].split() == ["1"] * 11
-    assert (lines["WIDTH"], lines["HEIGHT"], lines["POINTS"]) == (
-        str(count),
-        "1",
-        str(count),
-    )
+    for name, value in (("SIZE", "4"), ("TYPE", "F"), ("COUNT", "1")):
+        assert lines[name].split() == [value] * 11
+    sizes = [int(lines[name]) for name in ("WIDTH", "HEIGHT", "POINTS")]
+    assert sizes == [count, 1, count]
     assert body == stored.tobytes()

@@ -5,6 +5,8 @@ import json
 import pytest
 
 from radejax.core.errors import UserError
+from radejax.data.kradar.conditions import WEATHERS as KRADAR_WEATHERS
+from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.config import (
     CONDITIONS,
     FULL_SIZE,
@@ -24,20 +26,13 @@ SMALL = {"num_doppler": 8, "num_range": 32, "num_elevation": 5, "num_azimuth": 2
 def test_default_has_every_weather_in_training_and_several_held_out():
     config = SimulationOptions()
     train = [config.conditions(n)[2] for n in range(1, config.train_sequences + 1)]
-    assert set(train) == set(WEATHERS)
+    assert set(train) == set(WEATHERS) == set(KRADAR_WEATHERS)
+    assert {environment for environment, *_ in CONDITIONS} == set(ENVIRONMENTS)
     last = config.train_sequences + config.test_sequences
     held_out = [
         config.conditions(n)[2] for n in range(config.train_sequences + 1, last + 1)
     ]
     assert len(set(held_out)) >= 4
-
-
-def test_conditions_are_kradars():
-    for environment, time, weather in CONDITIONS:
-        assert environment in ENVIRONMENTS
-        assert weather in WEATHERS
-        assert time in ("day", "night")
-    assert {c[0] for c in CONDITIONS} == set(ENVIRONMENTS)
 
 
 @pytest.mark.parametrize(
@@ -72,50 +67,24 @@ def test_fingerprint_follows_every_change():
     ("change", "message"),
     [
         ({"sead": 1}, "sead is not a field; did you mean config.simulation.seed"),
-        ({"frames_per_sequence": 0}, "frames_per_sequence is 0, expected an integer"),
-        ({"seed": "one"}, "seed is 'one', expected an integer"),
         ({"train_sequences": 2.5}, "train_sequences is 2.5, expected an integer"),
-        ({"vru_density_scale": 9.0}, "is 9.0, expected a number of at most 5"),
-        (
-            {"vru_density_scale": 3, "scenes": "labels.zip"},
-            "is 3.0, expected 1 for scenes of real labels",
-        ),
+        ({"vru_density_scale": 3, "scenes": "a.zip"}, "is 3.0, expected 1 for scenes of"),
         ({"train_sequences": 0, "test_sequences": 0}, "expected a sequence"),
-        ({"output": "video"}, "'video', expected 'tesseract' or 'projection'"),
-        ({"camera_mode": "x"}, "is 'x', expected 'scene' or 'oracle'"),
         ({"grid": "velodyne"}, "expected 'kradar', or"),
         ({"grid": {"num_range": 3}}, "simulation.grid.num_doppler is missing"),
         ({"radar": {"power": 3}}, "simulation.radar.power is not a field"),
-        (
-            {"radar": {"azimuth_elements": -3}},
-            "simulation.radar.azimuth_elements is -3, expected a number",
-        ),
-        ({"radar": {"gain_db": float("nan")}}, "radar.gain_db is nan"),
-        ({"radar": {"noise_db": "loud"}}, "radar.noise_db is 'loud'"),
         ({"radar": {"noise_db": (3.0, 1.0)}}, "noise_db is .*the lower number first"),
         ({"radar": {"noise_db": (1, 2, 3)}}, "noise_db is .*lowest and the highest"),
         ({"radar": {"leakage": (0.1, 9.0)}}, "leakage is 9.0, expected a number"),
         ({"radar": "realistic"}, "radar is 'realistic', expected a dictionary"),
         ({"radar": {"preset": "perfect"}}, "expected 'ideal' or 'realistic'"),
-        (
-            {"radar": {"max_scatterers_per_row": 9.5}},
-            "max_scatterers_per_row is 9.5, expected an integer",
-        ),
-        ({"label_distance_m": 0}, "label_distance_m is 0, expected a number above 0"),
-        ({"label_distance_m": float("nan")}, "label_distance_m is nan"),
         ({"radar_from_lidar_m": (0.0,)}, "radar_from_lidar_m.* is missing"),
         ({"sequences": (5,)}, "selects sequences of real labels"),
-        (
-            {"grid": AXES | {"doppler_mps": (-1.0, 0.0, 3.0)}},
-            "doppler_mps is .* expected uniform bins",
-        ),
+        ({"grid": AXES | {"doppler_mps": (-1.0, 0.0, 3.0)}}, "expected uniform bins"),
         ({"grid": AXES | {"range_m": (3.0, 1.0)}}, "grid: range_m must be increasing"),
-        (
-            {"grid": AXES | {"azimut_rad": (3.0, 1.0)}},
-            "grid.azimut_rad is not a field; did you mean .*azimuth_rad",
-        ),
+        ({"grid": AXES | {"azimut_rad": (3.0,)}}, "not a field; did you mean .*azimuth_"),
     ],
-)
+)  # fmt: skip
 def test_wrong_values(change, message):
     with pytest.raises(UserError, match=message):
         SimulationOptions(**change)
@@ -135,11 +104,8 @@ def test_a_sensor_is_changed_or_replaced():
     assert full.make_parameters().azimuth_elements == RadarParameters().azimuth_elements
 
 
-def test_kradar_grid():
-    assert SimulationOptions(grid="kradar").make_grid().shape_drea == (64, 256, 37, 107)
-
-
-def test_a_grid_may_be_given_by_its_axes() -> None:
+def test_a_grid_may_be_given_by_its_name_or_axes() -> None:
+    assert SimulationOptions(grid="kradar").make_grid() == RadarGrid.kradar()
     grid = small.uneven_grid()
     found = SimulationOptions(grid=grid.to_dict())
     assert found.make_grid() == grid

@@ -1,7 +1,6 @@
 import json
 import math
 import shutil
-import time
 
 import numpy as np
 import pytest
@@ -126,42 +125,21 @@ def test_the_header_names_the_files_of_a_frame(tmp_path):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda root: KRadar(None), "no sequence folders"),
+        (lambda _: KRadar(None), "no sequence folders"),
         (lambda root: KRadar(root.parent), "no sequence folders"),
-        (
-            lambda root: KRadar(root / "no_labels"),
-            r"no v2\.1 labels in the sequence fold",
-        ),
+        (lambda root: KRadar(root / "no_labels"), r"no v2\.1 labels in the sequence fold"),
         (lambda root: KRadar(root / "none"), "none"),
         (lambda root: KRadar(root, version="v9"), "version 'v9' does not exist"),
-        (
-            lambda root: KRadar(root, split="validation"),
-            "'validation' is neither 'train',",
-        ),
-        (
-            lambda root: KRadar(root, visibility="L1"),
-            "visibility is 'L1', expected diff",
-        ),
-        (
-            lambda root: KRadar(root, classes=("Car",)),
-            r"classes is \('Car',\), expected di",
-        ),
-        (
-            lambda root: KRadar(root, classes=()),
-            r"classes is \(\), expected at least one",
-        ),
+        (lambda root: KRadar(root, split="validation"), "'validation' is neither 'train',"),
+        (lambda root: KRadar(root, visibility="L1"), "visibility is 'L1', expected diff"),
+        (lambda root: KRadar(root, classes=("Car",)), r"is \('Car',\), expected di"),
+        (lambda root: KRadar(root, classes=()), r"classes is \(\), expected at least one"),
         (lambda root: KRadar(root, weather=("mist",)), r"unknown weather \('mist',\)"),
         (lambda root: KRadar(root, weather=()), "unknown weather"),
-        (
-            lambda root: KRadar(root, sequence_numbers=[9]),
-            r"no labels .*\[9\]; .*\[1\]",
-        ),
-        (
-            lambda root: KRadar(root),
-            r"not an object of v2\.1 .*--config\.data\.label_vers",
-        ),
+        (lambda root: KRadar(root, sequence_numbers=[9]), r"no labels .*\[9\]; .*\[1\]"),
+        (lambda root: KRadar(root), r"not an object of v2\.1 .*--config\.data\.label_vers"),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_be_read_is_one_error(tmp_path, call, message):
     root = tmp_path / "root"
     write_frame(root, [sedan(10, 0), sedan(20, 0)], "v2.0")
@@ -236,9 +214,7 @@ def test_parsed_objects_equal_the_reference(shared, tmp_path):
 
 
 def test_published_counts_of_the_training_split(shared):
-    began = time.process_time()
     data = KRadar(labels=shared / "data/kradar/labels_v2_1.zip", split="train")
-    assert time.process_time() - began < 30
     assert len(data) == 17458
     assert list(data.class_counts().values()) == [28074, 5800, 2318, 190, 586]
     boxes = np.concatenate([frame.boxes for frame in data])
@@ -257,6 +233,7 @@ def test_published_counts_of_the_training_split(shared):
     assert not data.summary().problems
 
 
+@pytest.mark.slow
 def test_all_real_label_files_are_read(shared):
     everything = {"visibility": None, "classes": LABEL_CLASSES, "field_of_view": False}
     data = KRadar(labels=shared / "data/kradar/labels_v2_1.zip", **everything)
@@ -269,6 +246,20 @@ def test_all_real_label_files_are_read(shared):
     assert int((boxes[:, 0] < 0).sum()) == 8580
     assert int((boxes[:, 3] < boxes[:, 4]).sum()) == 2405
     assert int((np.abs(boxes[:, 6]) > math.pi).sum()) == 3218
+
+
+def test_parts_of_the_frames_are_counted(kradar_root, tmp_path):
+    data = KRadar(kradar_root)
+    rest = data.without({data[0].key, "9/x"}, "no record of them")
+    assert [frame.key for frame in rest] == [frame.key for frame in data][1:]
+    assert rest.counts["frames left out: no record of them"] == 1
+    assert "frames left out: no record of them" not in data.counts
+    root = shutil.copytree(kradar_root, tmp_path / "kradar")
+    write.write_description(root / "2/description.txt", "urban", "day", "rain")
+    data = KRadar(root, weather=["rain"])
+    assert {frame.sequence for frame in data} == {2}
+    assert data.counts["frames left out by weather"] == 6
+    assert len(KRadar(root, weather=("fog", "rain"))) == 12
 
 
 def test_labels_of_sequences_that_are_not_here_are_left_out_and_counted(
@@ -286,20 +277,3 @@ def test_labels_of_sequences_that_are_not_here_are_left_out_and_counted(
     assert len(KRadar(None, labels)) == 12  # labels alone
     with pytest.raises(UserError, match=r"no folders in the roots, of sequences \[2\]"):
         KRadar(part, labels, sequence_numbers=[1, 2])
-
-
-def test_a_part_is_chosen_by_weather(kradar_root, tmp_path):
-    root = shutil.copytree(kradar_root, tmp_path / "kradar")
-    write.write_description(root / "2/description.txt", "urban", "day", "rain")
-    data = KRadar(root, weather=["rain"])
-    assert {frame.sequence for frame in data} == {2}
-    assert data.counts["frames left out by weather"] == 6
-    assert len(KRadar(root, weather=("fog", "rain"))) == 12
-
-
-def test_frames_that_are_taken_away_are_counted(kradar_root):
-    data = KRadar(kradar_root)
-    rest = data.without({data[0].key, "9/x"}, "no record of them")
-    assert [frame.key for frame in rest] == [frame.key for frame in data][1:]
-    assert rest.counts["frames left out: no record of them"] == 1
-    assert "frames left out: no record of them" not in data.counts

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import UserError
-from radejax.data.kradar import KRadar
+from radejax.data.kradar import KRadar, write
 from radejax.data.kradar.check import check_dataset
-from radejax.data.kradar.folders import SIMULATION_MARKER, is_elevation_axis_up
+from radejax.data.kradar.folders import is_elevation_axis_up
 from radejax.data.kradar.reduce import reduce_dataset
 from radejax.data.kradar.reduced import project_reduced, reduce_tensor, strongest_points
 from radejax.data.kradar.tesseract import read_tesseract
@@ -27,6 +27,9 @@ def test_frames_are_those_of_the_tensors(kradar_root, tmp_path, release):
     root = reduced_root(kradar_root, tmp_path / "out", release)
     whole, data = KRadar(kradar_root), KRadar(root)
     assert (whole.release, data.release) == (None, release)
+    # Except in K-Radar itself, which has no grid file, the elevation axis points up.
+    assert is_elevation_axis_up([kradar_root])
+    assert not is_elevation_axis_up([tmp_path])
     assert [f.key for f in data] == [f.key for f in whole]
     assert not data.summary().problems
     assert data.grid == whole.grid
@@ -47,33 +50,24 @@ def test_frames_are_those_of_the_tensors(kradar_root, tmp_path, release):
         )
 
 
-def test_the_elevation_axis_points_up_except_in_kradar(kradar_root, tmp_path):
-    assert is_elevation_axis_up([kradar_root])  # with a grid of its own
-    assert not is_elevation_axis_up([tmp_path])
-    (tmp_path / SIMULATION_MARKER).touch()
-    assert is_elevation_axis_up([tmp_path])
-
-
 def test_writing_resumes_and_lists_corrupted_tensors(kradar_root, tmp_path):
     source = shutil.copytree(kradar_root, tmp_path / "in")
     (source / "records").mkdir()
-    (source / "1/radar_tesseract/tesseract_00004.mat").write_bytes(b"no tensor")
+    broken, decibels = sorted((source / "1/radar_tesseract").iterdir())[:2]
+    broken.write_bytes(b"no tensor")
+    write.write_tesseract(decibels, 10 * np.log10(read_tesseract(decibels)))
     out = tmp_path / "out"
     report = reduce_dataset([source], out, "polar3d")
-    assert (report.num_frames, report.num_written) == (12, 11)
-    ((path, reason),) = report.skipped.items()
-    assert path.endswith("tesseract_00004.mat")
-    assert "not a MATLAB v5 file" in reason
-    assert sorted(path.name for path in out.iterdir()) == [
-        "1",
-        "2",
-        "radar_grid.json",
-        "split",
-    ]
+    assert (report.num_frames, report.num_written) == (12, 10)
+    assert report.skipped.keys() == {str(broken), str(decibels)}
+    assert "not a MATLAB v5 file" in report.skipped[str(broken)]
+    assert "as in decibels" in report.skipped[str(decibels)]
+    names = sorted(path.name for path in out.iterdir())
+    assert names == ["1", "2", "radar_grid.json", "split"]
     assert (out / "1/description.txt").is_symlink()
     (out / "2/polar3d_00005.npy").unlink()
     again = reduce_dataset([source], out, "polar3d")
-    assert (again.num_found, again.num_written, len(again.skipped)) == (10, 1, 1)
+    assert (again.num_found, again.num_written, len(again.skipped)) == (9, 1, 2)
     with pytest.raises(UserError, match=r"rate is 1\.5, expected"):
         reduce_dataset([source], out, "rpc", 1.5)
     with pytest.raises(UserError, match=r"form of the radar data in .* is 'polar3d'"):
@@ -91,17 +85,6 @@ def test_points_of_another_rate_are_not_mixed(kradar_root, tmp_path):
     with pytest.raises(UserError, match=r"rate is 0\.1, expected about 0\.2, as of"):
         reduce_dataset([kradar_root], out, "rpc", 0.1)
     assert reduce_dataset([kradar_root], out, "rpc", 0.2).num_written == 1
-
-
-def test_tensors_in_decibels_are_not_reduced(kradar_root, kradar_writer, tmp_path):
-    from radejax.data.kradar import write
-
-    kradar_writer(tmp_path / "in", sequences=(1,), num_frames=1)
-    path = tmp_path / "in/1/radar_tesseract/tesseract_00004.mat"
-    tensor = 10 * np.log10(read_tesseract(path))
-    write.write_tesseract(path, tensor)
-    report = reduce_dataset([tmp_path / "in"], tmp_path / "out", "polar3d")
-    assert "as in decibels" in report.skipped[str(path)]
 
 
 def test_two_disks_a_label_zip_and_a_partial_copy(kradar_root, tmp_path):

@@ -25,7 +25,7 @@ labels = st.builds(
 )
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=30)
 @given(objects=st.lists(labels, max_size=4), version=st.sampled_from(VERSIONS))
 def test_labels_survive_writing_and_reading(tmp_path_factory, objects, version):
     path = tmp_path_factory.getbasetemp() / "round_trip" / "00033_00001.txt"

@@ -28,23 +28,6 @@ def test_details_stay_in_the_box(cls):
         assert np.abs(quad).max() <= 1.0 + 2e-2, detail
 
 
-@pytest.mark.parametrize("name", ["Sedan", "Bus or Truck"])
-def test_vehicles_are_the_same_on_both_sides(name):
-    corners = shapes.blocks_of(name)
-
-    def places(face):
-        found = []
-        for d in details.DETAILS[name]:
-            if d.face == face:
-                quad = corners[d.block][shapes._VERTICES[face]][None]
-                found.append(details.on_faces(quad, np.array([d.u]), np.array([d.v])))
-        return np.sort(np.abs(np.concatenate(found).mean(1)), axis=0)
-
-    np.testing.assert_allclose(
-        places(details.LEFT), places(details.RIGHT), rtol=0, atol=1e-12
-    )
-
-
 def frame_of(environment, seed):
     rng = np.random.default_rng(seed)
     return make_sequence(1, (environment, "day", "normal"), 2, rng).frame(0)

@@ -9,12 +9,6 @@ from radejax.simulation.camera import lens
 from radejax.simulation.radar.propagation import WEATHERS
 
 
-def test_every_weather_has_air_and_cover():
-    assert set(lens.AIR) == set(WEATHERS)
-    for air in lens.AIR.values():
-        assert sum(air.cover) == pytest.approx(1.0)
-
-
 def test_covered_frames_of_all_of_kradar_are_as_many_as_counted(shared):
     # DinoRADE: 7.5k partly, 4.8k heavily, 4.9k fully covered of 35k frames.
     expected = dict.fromkeys(lens.LEVELS, 0.0)

@@ -146,7 +146,7 @@ class TestNoise:
 
 
 class TestLeakage:
-    @pytest.mark.parametrize("elements", [12.0, 41.0, 48.0])
+    @pytest.mark.parametrize("elements", [12.0, 41.0])
     def test_mean_level_is_as_wanted_and_the_peak_remains(self, elements):
         beams = np.linspace(-0.9, 0.9, 91)
         basis = tensor.array_basis(beams, elements, 0.5)
@@ -154,7 +154,7 @@ class TestLeakage:
             azimuth_elements=elements, leakage=0.04, array_pedestal=0.5
         )
         power = []
-        for seed in range(300):
+        for seed in range(100):
             state = sensor.draw_state(GRID, parameters, np.random.default_rng(seed))
             phase = state.azimuth_phase_rad
             signal = tensor.array_signal(np.float32([beams[20]]), elements, 0.5, phase)
@@ -238,7 +238,7 @@ class TestGroundClutter:
 def test_statistics_of_the_coarse_sensor_are_near_those_of_the_real_map():
     """The limits are those for full-size frames, where the coarse grid has the bins."""
     levels, leakage, states = [], [], []
-    for made in simulators(8):
+    for made in simulators(5):
         given = made.radar_input(made.sequence.frame(0))
         level = 10.0 * np.log10(made.run(given, "tesseract").mean((0, 2)))
         noise = np.median(level[25:54])  # 30 to 65 m
@@ -259,4 +259,4 @@ def test_statistics_of_the_coarse_sensor_are_near_those_of_the_real_map():
     assert -6.0 < dip < 6.0
     assert -7.0 < end < -2.0
     assert -20.0 < np.median(leakage) < -9.0
-    assert len(set(states)) == 8
+    assert len(set(states)) == 5

@@ -108,11 +108,6 @@ class TestScene:
         relative = replay.relative_velocity(tracks, clock)
         assert np.abs(relative).max() < replay.MAX_SPEED_MPS
 
-    def test_without_vehicles_the_road_type_decides_the_speed(self):
-        empty = replay.collect_tracks([], OFFSET)
-        assert empty.position_m.shape == (0, 0, 3)
-
-
 class TestWrittenTree:
     def test_labels_out_are_labels_in(self, labels_folder, tmp_path):
         root = simulate_dataset(
@@ -143,7 +138,7 @@ class TestWrittenTree:
         assert source.frames(3)[1].indices == (34, 4, 8, 12, 14)
 
     @pytest.mark.parametrize("stride", [1, 2])
-    @pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 9, 16])
+    @pytest.mark.parametrize("count", [1, 2, 3, 5, 9])
     def test_few_frames_are_in_both_splits(self, labels_folder, count, stride):
         config = make_config(
             labels_folder, frame_stride=stride, frames_per_sequence=count

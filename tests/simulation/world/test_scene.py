@@ -13,10 +13,6 @@ def test_wrap_angle(angle, expected):
     assert scene.wrap_angle(np.array([angle])) == pytest.approx([expected])
 
 
-def test_groups_count_as_their_single_class():
-    assert scene.class_index("Pedestrian Group") == scene.class_index("Pedestrian") == 2
-
-
 def test_points_seen_from_a_turned_ego_by_hand():
     # At (10, 5), heading left: what is 3 m along +y in the world is 3 m ahead.
     points = np.array([[10.0, 8.0, 0.5], [9.0, 5.0, 0.0]])
@@ -42,13 +38,14 @@ class TestOcclusion:
         blocked = scene.is_blocked(np.array([point]), self.BOX, np.array([-1]))
         assert blocked.tolist() == [expected]
 
-    def test_turned_box(self):
+    def test_turned_and_own_boxes(self):
         turned = self.BOX.copy()
         turned[0, 6] = np.pi / 2  # now 4 m across: 1.7 m off center is inside
-        point = np.array([[40.0, 3.4, 0.0]])
-        assert scene.is_blocked(point, turned, np.array([-1]))[0]
-        assert not scene.is_blocked(point, self.BOX, np.array([-1]))[0]
-
-    def test_own_box_does_not_block(self):
-        inside = np.array([[22.0, 0.0, 0.0]])
-        assert not scene.is_blocked(inside, self.BOX, np.array([0]))[0]
+        points = np.array([[40.0, 3.4, 0.0], [40.0, 0.0, 0.0]])
+        for box, owners, expected in (
+            (turned, [-1, -1], [True, True]),
+            (self.BOX, [-1, -1], [False, True]),
+            (self.BOX, [0, 0], [False, False]),
+        ):
+            blocked = scene.is_blocked(points, box, np.array(owners))
+            assert blocked.tolist() == expected

@@ -74,7 +74,7 @@ def test_vru_density_scale_multiplies_the_number_of_vrus():
         scenes = [
             sequence(environment, seed, 1, vru_density_scale=times)
             for environment in ("urban", "university")
-            for seed in range(80)
+            for seed in range(40)
         ]
         return sum(np.bincount(s.tracks.cls, minlength=5) for s in scenes)
 
