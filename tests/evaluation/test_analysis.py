@@ -9,8 +9,6 @@ from radejax.evaluation.files import Source, load
 from radejax.evaluation.report import write_report
 from radejax.evaluation.results import ReportOptions
 
-from .scenes import random_scene
-
 CLASSES = ("Sedan", "Bus or Truck")
 
 
@@ -84,17 +82,6 @@ def test_by_time_by_hand(data):
     assert "weather" not in analysis.subsets(data, FRAMES, 0.3)
 
 
-def test_subsets_sum_to_everything():
-    truth, found, frames = random_scene(5)
-    data = EvaluationSet(truth, found, classes=CLASSES, frames=frames)
-    for entries in analysis.subsets(data, frames, 0.3).values():
-        assert sum(n["num_gt"] for n in entries) == len(data.gt)
-        assert sum(n["num_det"] for n in entries) == (data.pred.score > 0.3).sum()
-    whole = _numbers(data, "time", {"time": np.full(len(frames["frame"]), "day")})
-    for result in data.results("all_point", iou_thresholds=0.3, spaces="3d"):
-        assert whole["day", result.cls]["ap"] == pytest.approx(result.ap)
-
-
 def test_box_errors_by_hand(data):
     errors = analysis.box_errors(data, 0.3)["Sedan"]
     assert errors["count"] == 2
@@ -115,13 +102,6 @@ def test_worst_frames_by_hand(data):
         (103, 0, 1, 0),
     ]
     assert [entry["sequence"] for entry in worst] == [5, 5, 5, 6]
-
-
-def test_analysis_without_any_boxes():
-    data = make([], [])
-    assert analysis.worst_frames(data, FRAMES, 0.3) == []
-    assert analysis.box_errors(data, 0.3)["Sedan"]["count"] == 0
-    assert all(n["num_gt"] == 0 for n in _numbers(data, "distance").values())
 
 
 # Sanity checks ------------------------------------------------------------------------

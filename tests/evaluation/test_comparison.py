@@ -7,7 +7,7 @@ from click.testing import CliRunner
 
 from radejax.cli.main import main
 from radejax.core.errors import UserError
-from radejax.evaluation import analysis, kitti
+from radejax.evaluation import kitti
 from radejax.evaluation.comparison import (
     compare,
     compare_files,
@@ -19,9 +19,7 @@ from radejax.evaluation.files import Source, evaluate_files, stored_options
 from radejax.evaluation.report import write_report
 from radejax.evaluation.results import (
     ReportOptions,
-    compute_results,
     interval,
-    make_set,
     resample,
     sequence_weights,
 )
@@ -211,28 +209,6 @@ def test_seeds_of_one_config_are_never_called_different():
     assert num_different <= 1  # 5 % of the pairs of sets of seeds
     # This is why single trainings are not tested.
     assert np.mean(np.array(p_values) < 0.1) > 0.2
-
-
-def test_rows_by_weather_and_distance_agree_with_the_report():
-    options = settings(protocols=("all_point", "kradar_r40"), score_threshold=0.4)
-    data = make_set(TRUTH, FOUND, FRAMES, options)
-    results = {row.key: row for row in compute_results(data, FRAMES, options)}
-    rows = compare({"": data}, {"": data}, FRAMES, options)
-    by_distance = {
-        (entry["distance"], entry["cls"]): entry["ap"]
-        for entry in analysis.subsets(data, FRAMES, 0.3)["distance"]
-    }
-    num_distances = 0
-    for row in rows:
-        if row.kind != "distance":
-            same = results[row.protocol, row.condition, row.cls, row.space, row.iou]
-            assert row.ap_a == pytest.approx(same.ap)
-            assert row.score_threshold == same.score_threshold
-        elif row.space == "3d" and row.cls != "mean":
-            num_distances += 1
-            assert row.ap_a == pytest.approx(by_distance[row.condition, row.cls])
-    assert num_distances > 2
-    assert {row.score_threshold for row in rows if row.protocol == "all_point"} == {0.0}
 
 
 # Runs in files ------------------------------------------------------------------------

@@ -70,31 +70,6 @@ def test_greedy_equals_a_loop(seed):
     assert sorted(chosen.tolist()) == naive_greedy(claimant, target, preference, group)
 
 
-def steps_of(match):
-    """By how much the number of true positives changes at each prediction."""
-    pairs_of = zip(match.event_pred.tolist(), match.event_delta.tolist(), strict=True)
-    return dict(pairs_of)
-
-
-def test_kradar_passes_differ():
-    # First pass by score: ground truth 0 takes prediction 1 (score 0.9), 1 takes 0.
-    # Second pass by IoU at a threshold that both reach: 0 takes 0, and 1, which only
-    # overlaps prediction 0, gets nothing. Sinking to 0.5 adds no true positive then.
-    chosen = pairs((0, 0, 0.8), (1, 0, 0.6), (0, 1, 0.7))
-    match = matching.match_kradar(chosen, np.array([0.5, 0.9]), np.zeros(2, int), 0.3)
-    assert match.first_pred.tolist() == [1, 0]
-    assert steps_of(match) == {1: 1, 0: 0}
-
-
-def test_a_prediction_that_displaces_another_adds_nothing():
-    # At 0.5, prediction 1 enters and takes ground truth 0 from prediction 0, which
-    # overlaps nothing else: ground truth 1, that only overlaps prediction 1, stays unmatched.
-    chosen = pairs((0, 0, 0.5), (1, 0, 0.9), (1, 1, 0.6))
-    score = np.array([0.9, 0.5])
-    match = matching.match_kradar(chosen, score, np.zeros(2, int), 0.3)
-    assert steps_of(match) == {0: 1, 1: 0}
-
-
 def second_pass_loop(pred, gt, iou, score, threshold):
     """True positives at one score threshold."""
     taken, found = set(), 0
@@ -128,16 +103,6 @@ def test_second_pass_equals_a_loop_at_every_threshold(monkeypatch, seed, chunk):
         steps = match.event_delta[score[match.event_pred] >= threshold].sum()
         expected = second_pass_loop(pred[keep], gt[keep], iou[keep], score, threshold)
         assert steps == expected
-
-
-def test_best_and_free_differ():
-    # Both predictions prefer ground truth 0; only the free rule gives 1 the other one.
-    chosen = pairs((0, 0, 0.9), (1, 0, 0.8), (1, 1, 0.5))
-    score = np.array([0.9, 0.8])
-    best = matching.match_best(chosen, score, 0.3)
-    free = matching.match_free(chosen, score, np.zeros(2, int), 2, 0.3)
-    assert best.tolist() == [0, -1]
-    assert free.tolist() == [0, 1]
 
 
 def test_higher_score_wins_and_first_row_breaks_ties():

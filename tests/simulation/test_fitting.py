@@ -22,7 +22,6 @@ from radejax.simulation.dataset import simulate_dataset
 from radejax.simulation.fitting import fit_files, fit_radar
 from radejax.simulation.radar import sensor, tensor
 from radejax.simulation.radar.tensor import RadarParameters
-from radejax.simulation.simulator import SequenceSimulator, make_source
 
 from .radar.test_tensor import points
 
@@ -88,30 +87,6 @@ def test_the_parameters_of_a_simulated_recording_are_found(seed, noise_db, **cha
     np.testing.assert_allclose(
         level_db, profile[rows], atol=3.0
     )  # steepest at the ends
-
-
-def test_several_recordings_give_ranges_and_medians():
-    pairs = [recording(seed=n, noise_db=99.0 + n, leakage=0.03) for n in range(3)]
-    found = fit_radar((power for power, _ in pairs), GRID)
-    low, high = found["noise_db"]
-    assert (low, high) == pytest.approx((99.0, 101.0), abs=0.8)
-    assert found["azimuth_elements"] == pytest.approx(48.0, abs=2.0)
-    assert len(found["leakage"]) == 2
-
-
-def test_what_was_found_is_simulated_again():
-    power, _ = recording(leakage=0.05, range_correlation=0.3, azimuth_elements=40.0)
-    found = fit_radar([power], GRID)
-    fields = json.loads(json.dumps(found))
-    config = SimulationOptions(radar=fields, frames_per_sequence=1)
-    assert config.make_grid() == GRID
-    parameters = config.make_parameters()
-    assert parameters.profile_db == tuple(map(tuple, found["profile_db"]))
-    hash(parameters)  # a static argument
-    sequence = make_source(config).make(1)
-    simulator = SequenceSimulator(sequence, config)
-    again = simulator.run(simulator.radar_input(sequence.frame(0)), "tesseract")
-    assert fit_radar([again], GRID)["noise_db"] == pytest.approx(100.0, abs=1.0)
 
 
 def test_recordings_without_noise_are_refused():

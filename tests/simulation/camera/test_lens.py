@@ -6,7 +6,6 @@ import pytest
 
 from radejax.data.kradar.conditions import KRADAR_CONDITIONS
 from radejax.simulation.camera import lens
-from radejax.simulation.radar.propagation import WEATHERS
 
 
 def test_covered_frames_of_all_of_kradar_are_as_many_as_counted(shared):

@@ -108,6 +108,7 @@ class TestScene:
         relative = replay.relative_velocity(tracks, clock)
         assert np.abs(relative).max() < replay.MAX_SPEED_MPS
 
+
 class TestWrittenTree:
     def test_labels_out_are_labels_in(self, labels_folder, tmp_path):
         root = simulate_dataset(

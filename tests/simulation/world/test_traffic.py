@@ -69,21 +69,6 @@ def test_all_classes_and_sedans_everywhere():
     assert seen == set(range(5))
 
 
-def test_vru_density_scale_multiplies_the_number_of_vrus():
-    def counted(times):
-        scenes = [
-            sequence(environment, seed, 1, vru_density_scale=times)
-            for environment in ("urban", "university")
-            for seed in range(40)
-        ]
-        return sum(np.bincount(s.tracks.cls, minlength=5) for s in scenes)
-
-    own, more, none = counted(1.0), counted(3.0), counted(0.0)
-    np.testing.assert_allclose(more[2:] / own[2:], 3.0, rtol=0.25)
-    assert own[0] > more[0] > 0.7 * own[0]  # where motorcycles drive no car does
-    assert not none[2:].any()
-
-
 def test_traffic_goes_both_ways_and_parks():
     scene = sequence("urban", num_frames=2)
     frame = scene.frame(0)
