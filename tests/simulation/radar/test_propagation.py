@@ -87,6 +87,12 @@ class TestBounce:
         # The metal turns the phase: whole wavelengths cancel, halves add to 16.
         np.testing.assert_allclose(power, [0.0, 16.0], atol=1e-3)
 
+    def test_nothing_comes_back_from_an_even_metal_floor_itself(self):
+        at = np.array([[20.0, 5.0, -0.9], [20.0, 5.0, -1.3]])
+        np.testing.assert_allclose(
+            propagation.bounce(at, -0.9, METAL, WAVELENGTH), 0.0, atol=1e-6
+        )
+
     def test_equals_the_sum_of_four_ways(self):
         at = np.array([[13.0, -4.0, 0.4]])
         radar, image = np.zeros(3), np.array([0.0, 0.0, -1.8])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -90,6 +92,21 @@ class TestNoise:
         assert abs(median(30, 95)) < 0.01
         assert median(107, 114) == pytest.approx(-4.0, abs=1.0)
         assert profile[-1] == pytest.approx(11.0, abs=0.1)
+
+    def test_profile_scales_in_db_and_keeps_its_end_at_the_last_bins(self):
+        whole = self.profile_db(GRID, range_profile=1.0)
+        half = self.profile_db(GRID, range_profile=0.5)
+        np.testing.assert_allclose(half, whole / 2.0, atol=0.3)
+        near = dataclasses.replace(GRID, range_m=np.linspace(0.0, 50.0, 64))
+        assert self.profile_db(near, range_profile=1.0)[-1] > 10.0
+        assert (self.profile_db(GRID) == 0.0).all()
+
+    def test_gain_of_the_receiver_moves_noise_and_echoes(self):
+        sensors = RadarParameters(), RadarParameters(receiver_db=10.0)
+        given = [
+            propagation.noise_profile("rain", GRID, s, np.zeros(2)) for s in sensors
+        ]
+        np.testing.assert_allclose(given[1], 10.0 * given[0], rtol=1e-5)
 
     def test_leak_is_in_the_doppler_bin_of_velocity_zero(self):
         power = sensor.receiver_noise(GRID, RadarParameters(range_profile=1.0))
