@@ -149,37 +149,6 @@ def test_what_cannot_be_read_is_one_error(tmp_path, call, message):
     assert len(KRadar(root, version="v2.0")[0].boxes) == 2
 
 
-def test_problems_are_counted_and_named(tmp_path, kradar_writer):
-    kradar_writer(tmp_path, sequences=(1,), num_frames=6)
-    labels = tmp_path / "1/info_label"
-    (labels / "00005_00002.txt").write_text("")
-    with open(labels / "00006_00003.txt", "a") as file:
-        file.write("*, R, 9, Sedan, 1, 2\n")
-    (tmp_path / "1/radar_tesseract/tesseract_00007.mat").unlink()
-    (tmp_path / "1/info_calib/calib_radar_lidar.txt").write_text("x\n1\n")
-    (tmp_path / "1/description.txt").write_text("fog")
-    data = KRadar(tmp_path)
-    summary = data.summary()
-    assert len(data) == 5
-    assert summary.problem_counts() == {
-        "label file": 1,
-        "label line": 1,
-        "calibration": 1,
-        "description": 1,
-        "tesseract missing": 1,
-    }
-    text = summary.to_text()
-    assert "00005_00002.txt:1: '' is not a header" in text
-    assert "00006_00003.txt:" in text
-    assert "calib_radar_lidar.txt:2: '1', expected three numbers" in text
-    assert "no radar_tesseract/tesseract_00007.mat in" in text
-    assert data[0].radar_from_lidar_m == (-2.54, 0.3, 0.0)
-    assert (data[0].time, data[0].weather) == ("night", "normal")  # of sequence 1
-    assert json.loads(json.dumps(summary.to_dict()))["counts"]["frames"] == 5
-    assert data[3].tesseract_path is not None
-    assert data[2].tesseract_path is None
-
-
 # The reference data -----------------------------------------------------------------
 
 

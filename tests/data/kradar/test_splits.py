@@ -21,14 +21,11 @@ def select(tmp_path, **options):
     return [(frame.sequence, frame.name) for frame in data], data
 
 
-def test_everything_sorted(tmp_path):
-    assert select(tmp_path)[0] == KEYS
-    assert select(tmp_path, sequence_numbers=[2])[0] == KEYS[8:]
-
-
 def test_rule_and_file(tmp_path):
     keys, data = select(tmp_path, split="train")
     assert keys == [KEYS[i] for i in (0, 1, 4, 5)]
+    assert select(tmp_path)[0] == KEYS
+    assert select(tmp_path, sequence_numbers=[2])[0] == KEYS[8:]
     assert "K-Radar's rule" in data.summary().to_text()
     # A file in `split/` takes precedence over the rule.
     write.write_splits(tmp_path / "split", [KEYS[7], KEYS[3]], [])
@@ -39,26 +36,6 @@ def test_rule_and_file(tmp_path):
     own = tmp_path / "own.txt"
     own.write_text("2,00000_00000.txt\n")
     assert select(tmp_path, split=own)[0] == KEYS[8:]
-
-
-def test_a_frame_in_both_splits_is_reported(tmp_path, caplog):
-    write.write_splits(tmp_path / "split", KEYS[:4], KEYS[4:])
-    assert not select(tmp_path, split="test")[1].summary().problems
-    assert not caplog.text
-    write.write_splits(tmp_path / "split", KEYS[:4], KEYS[3:])
-    keys, data = select(tmp_path, split="train")
-    assert keys == KEYS[:4]
-    assert data.summary().problem_counts() == {"split": 1}
-    assert "1/00003_00003: the first of 1 frames that are in both" in caplog.text
-
-
-def test_entries_without_labels_are_reported(tmp_path):
-    (tmp_path / "train.txt").write_text("1,00099_00099.txt\n9,00099_00099.txt\n")
-    keys, data = select(tmp_path, split="train")
-    assert keys == []
-    assert data.summary().problem_counts() == {"label file missing": 1}
-    assert "1/00099_00099: in split train but" in data.summary().to_text()
-    assert data.counts["split entries of sequences that are not here"] == 1
 
 
 def test_rule_gives_alternating_quarters():

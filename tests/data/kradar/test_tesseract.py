@@ -58,7 +58,7 @@ def test_every_kind_of_file(tmp_path, tesseract, kind, dtype):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("keep", [0, 3, 100, 150, 199, 250, -1])
+@pytest.mark.parametrize("keep", [0, 100, 150, 250, -1])
 def test_truncated_files_are_named(tmp_path, tesseract, kind, keep):
     path = tmp_path / "t.mat"
     write(path, tesseract, kind)
@@ -123,10 +123,10 @@ def test_small_integers_of_floats_are_read(tmp_path):
 
 def test_no_more_is_inflated_than_is_claimed(tmp_path):
     path = tmp_path / "t.mat"
-    scipy.io.savemat(path, {"arrDREA": np.zeros((64, 64, 32, 32))}, do_compression=True)
+    scipy.io.savemat(path, {"arrDREA": np.zeros((64, 64, 8, 8))}, do_compression=True)
     content = path.read_bytes()
     raw = bytearray(zlib.decompress(content[136:]))
-    bomb = zlib.compress(bytes(raw) + bytes(1 << 26))
+    bomb = zlib.compress(bytes(raw) + bytes(1 << 24), 1)
     path.write_bytes(content[:132] + struct.pack("<I", len(bomb)) + bomb)
     with pytest.raises(DataError, match="does not inflate to"):
         read_tesseract(path)
