@@ -1,6 +1,5 @@
 """Tests of the ablations: runs, resuming, differences and verdicts."""
 
-import dataclasses
 import json
 import pathlib
 from typing import Any
@@ -11,17 +10,12 @@ import pytest
 from click.testing import CliRunner
 
 from radejax.config import load_config, with_texts
-from radejax.core import files
 from radejax.core.structures import CLASSES
-from radejax.data.kradar import KRadar
 from radejax.evaluation.report import write_report
 from radejax.evaluation.results import ReportOptions
-from radejax.simulation.dataset import simulate_dataset
 
 SKILL = {"sigma 3": 0.4, "model": 0.7, "sigma 0.75": 0.9, "shuffled labels": 0.1}
 """Fraction of the objects that a cell detects; 0.5 by default."""
-
-GRID = {"doppler": 4, "range": 32, "elevation": 5, "azimuth": 28}
 
 
 class _Runs:
@@ -110,44 +104,6 @@ def test_what_is_missing_is_run_and_judged(
     assert verdicts["sanity check: labels matter"] == "supported"
     assert "supported" in (tmp_path / "table_sigma.md").read_text()
     assert r"\begin{tabular}" in (tmp_path / "table_sigma.tex").read_text()
-    # Tables share cells: nothing is run again.
-    before = len(runs.trained)
-    command = ["--table", "3", "--seeds", "0", "--resamples", "40"]
-    CliRunner().invoke(ablation.main, [*command, "--out", str(tmp_path)])
-    assert len(runs.trained) == before + 6  # not model, not the exchanged labels
-
-
-def test_each_of_several_processes_has_seeds_of_its_own(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    runs = _Runs(monkeypatch)
-    with files.lock(tmp_path / "seed0.lock", "of another"):
-        text = _call(tmp_path, "--seeds", "0,4")
-    assert "seed 0: another process works on it" in text
-    assert {config.seed for _, config in runs.trained} == {4}
-    assert "12 of 12 runs are done" in _call(tmp_path, "--seeds", "0,4")
-
-
-def test_splits_of_the_last_frames(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A study of several frames a sequence; others leave the splits as they are."""
-    frames = [(number, f"{i + 7:05d}_{i:05d}") for number in (1, 2) for i in (1, 2, 3)]
-
-    def simulate(simulation: Any, root: pathlib.Path) -> pathlib.Path:
-        assert simulation.frames_per_sequence == 2
-        if not root.exists():
-            ablation.write_splits(root / "split", train=frames, test=frames[:2])
-        return root
-
-    monkeypatch.setattr(ablation, "simulate_dataset", simulate)
-    work = ablation.Work(ablation.STUDIES["frames"], tmp_path)
-    for seed in (0, 0, None):  # the same again: a command that is resumed
-        root = pathlib.Path(work.data(work.study.cells["two frames"], seed))
-        read = {p.stem: ablation.read_split(p) for p in root.glob("split/*.txt")}
-        assert read == {"train": [frames[2], frames[5]], "test": [frames[1]]}
-    assert work.held_split == "test"
-    assert ablation.Work(ablation.STUDIES["3"], tmp_path).held_split == "all"
 
 
 @pytest.mark.parametrize(
@@ -163,19 +119,6 @@ def test_splits_of_the_last_frames(
 )
 def test_verdicts(numbers: tuple[float, ...], word: str) -> None:
     assert ablation.verdict(*numbers) == word
-
-
-def test_intervals_are_paired(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Equal runs have no difference, even with few scenes."""
-    runs = _Runs(monkeypatch)
-    monkeypatch.setitem(SKILL, "sigma 3", 0.5)
-    _call(tmp_path, "--seeds", "1")
-    assert len(runs.trained) == 6
-    rows = json.loads((tmp_path / "table_sigma.json").read_text())["rows"]
-    (row,) = (r for r in rows if (r["cell"], r["cls"]) == ("adaptive", "Sedan"))
-    assert (row["difference"], row["low"], row["high"]) == (0, 0, 0)
 
 
 @pytest.mark.parametrize("table", sorted(ablation.STUDIES))
@@ -200,66 +143,3 @@ def test_every_cell_is_a_config_and_its_command_makes_it(table: str) -> None:
     for claim in study.claims:
         assert {claim.a, claim.b} <= set(study.cells)
         assert claim.cls in (*CLASSES, "mean")
-
-
-def test_releases_are_made_of_the_tensors_of_the_same_scenes(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """With real data: simulated tensors, the frames of the releases, their projections."""
-    study = ablation.STUDIES["releases"]
-    grid = {f"simulation.grid.num_{k}": n for k, n in GRID.items()}
-    bins = {f"model.{k}_bins": GRID[k] for k in ("doppler", "elevation")}
-    size = {"simulation.train_sequences": 2, "simulation.image_width": 32}
-    cells = {
-        name: dataclasses.replace(cell, fields={**bins, **cell.fields, **size, **grid})
-        for name, cell in study.cells.items()
-        if cell.config == study.cells[study.base].config
-    }
-    study = dataclasses.replace(study, cells=cells, held_out=3)
-    work = ablation.Work(study, tmp_path)
-    found = {}
-    for seed, count in ((1, 4), (None, 3)):
-        for name, cell in cells.items():
-            root = work.data(cell, seed)
-            frames = KRadar(root)
-            assert len(frames) == count
-            assert frames.release == (cell.release and cell.release.split()[0])
-            found[name] = frames[0].read_projection(frames.grid)
-            experiment_config = work.config(cell, seed or 0)
-            if seed is not None:  # the run finds the data complete
-                simulate_dataset(experiment_config.simulation, root)
-    base, polar = found["input centered"], found["polar3d"]
-    assert (base.max(-1) > polar.max(-1)).mean() > 0.95
-    num_cells = [(found[f"{rate} % points"] > 0.5).sum() for rate in (10, 1, 0.1)]
-    assert num_cells[0] > num_cells[1] > num_cells[2] > 0
-    tensors = sorted(path.name for path in (tmp_path / "data").iterdir())
-    assert tensors == [
-        f"quickstart-{part}{end}"
-        for part in ("2-seed1", "held")
-        for end in ("", "-polar3d", "-rpc0.001", "-rpc0.01", "-rpc0.1", "-tensors")
-    ]
-
-
-@pytest.mark.parametrize("table", sorted(ablation.STUDIES))
-def test_documented_numbers_are_those_of_the_table_beside(table: str) -> None:
-    docs = ablation.CONFIGS.parent / "docs"
-    stored = docs / "reports" / "ablations" / f"table_{table}"
-    content = json.loads(stored.with_suffix(".json").read_text())
-    page = (docs / "results.md").read_text()
-    markdown = stored.with_suffix(".md").read_text()
-    lines = (line.strip("|").split("|") for line in markdown.splitlines())
-    claims = [[cell.strip() for cell in line] for line in lines]
-    study = ablation.STUDIES[table]
-    whole = [row for row in content["rows"] if row["condition"] == "all"]
-    rows = {(row["cell"], row["cls"]): row for row in whole}
-    for cell in study.cells:
-        assert rows[cell, "mean"]["seeds"] == [0, 1, 2]
-        aps = [f"{rows[cell, cls]['ap']:.1f}" for cls in (*CLASSES, "mean")]
-        assert f"| {' | '.join([cell, '0, 1, 2', *aps])} |" in page
-    for claim in content["claims"]:
-        gap = "{difference:+.1f} ({low:.1f} to {high:.1f})".format(**claim)
-        cells = claim["text"], claim["a"], claim["b"], claim["cls"], gap, "0, 1, 2"
-        assert [*cells, claim["verdict"]] in claims
-    assert [c["text"] for c in content["claims"]] == [c.text for c in study.claims]
-    assert len(content["commands"]) == 3 * len(study.cells)
-    assert not any(" /" in command for command in content["commands"].values())

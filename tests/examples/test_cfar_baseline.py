@@ -19,7 +19,7 @@ from radejax.simulation.dataset import simulate_dataset
 def data(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     """A small dataset without images, with records."""
     root = tmp_path_factory.mktemp("data")
-    size = {"train_sequences": 2, "test_sequences": 1, "frames_per_sequence": 8}
+    size = {"train_sequences": 2, "test_sequences": 1, "frames_per_sequence": 4}
     options = SimulationOptions(**size, image_width=0, output="projection")
     simulate_dataset(options, root, progress=False)
     preprocess(KRadar(root), root / "records", num_workers=0, progress=False)
@@ -35,12 +35,6 @@ def test_cfar_baseline_fits_detects_and_reports(data, tmp_path, capsys):
     sedan = next(row for row in of_sedans if row["condition"] == "all")
     assert sedan["num_det"] > 0
     assert 0.0 < sedan["ap"] < 95.0
-
-    # The same training data, named explicitly.
-    again = module.run_baseline(
-        data, tmp_path / "again", protocols=("all_point",), fit_data=data
-    )
-    assert again.text == report.text
     # Fitted on training frames; each frame's predictions are those of the detector.
     records = open_projections(data / "records")
     settings = module.fit(records, KRadar(data, split="train"))

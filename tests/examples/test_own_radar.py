@@ -10,7 +10,6 @@ import pytest
 from click.testing import CliRunner
 from own_radar import GRID, OwnRadar
 
-from radejax.config import check_bins
 from radejax.core.errors import DataError, UserError
 from radejax.data.options import DataOptions
 from radejax.data.projection import LOG_OFFSET_DB, LOG_SCALE_DB
@@ -86,10 +85,6 @@ def test_a_wrong_line_is_named(tmp_path: pathlib.Path, power: np.ndarray) -> Non
     lines = [f"0004_0001,car,{BOX}", f"0004_0001,car,east{BOX}"]
     with pytest.raises(DataError, match=r"boxes.csv, line 3: .*convert string"):
         read(write(tmp_path, lines, power))
-
-
-def test_the_config_fits_the_radar() -> None:
-    check_bins(own_radar.get_config().model, GRID, "the radar")
 
 
 @pytest.mark.slow

@@ -60,14 +60,6 @@ def test_patches_show_the_classes_that_are_drawn():
     assert flat.nearness[is_full].min() > 0.08
 
 
-def test_small_objects_take_the_place_of_cars():
-    some, many = _drawn(12), _drawn(12, share=1.0)
-    sedan, *_ = counts = many.pixels.sum((0, 1, 2))
-    assert sedan == 0
-    small_ones = list(pretraining.SMALL)
-    assert (counts[small_ones] > some.pixels.sum((0, 1, 2))[small_ones]).all()
-
-
 def test_average_precision_by_hand():
     score, right = np.array([0.9, 0.8, 0.7, 0.1]), np.array([1, 0, 1, 0], bool)
     assert pretraining.average_precision(score, right) == pytest.approx((1 + 2 / 3) / 2)

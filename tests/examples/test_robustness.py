@@ -9,23 +9,7 @@ import robustness
 from click.testing import CliRunner
 
 from radejax.config import load_config
-from radejax.simulation.config import PRESETS, RadarOptions
 from radejax.simulation.radar.tensor import DRAWN
-
-
-def test_every_radar_has_one_effect_at_the_edge_of_its_range() -> None:
-    found = dict(robustness.radars())
-    assert len(found) == 2 + 2 * len(DRAWN)
-    for name, fields in found.items():
-        parameters = RadarOptions(**fields).make_parameters()
-        drawn = {field for field, _, _ in parameters.ranges}
-        if name == "ideal":
-            assert not drawn
-        elif name != "realistic":
-            field, value = name.split()
-            assert drawn == DRAWN - {field}
-            assert getattr(parameters, field) == float(value)
-            assert float(value) in PRESETS["realistic"][field]
 
 
 def test_table_has_the_share_that_each_radar_loses(

@@ -51,23 +51,15 @@ def _start(folder, first="waits", second=0, arguments=(), **variables):
     )
 
 
-def _requeued(folder):
-    path = folder / "scontrol"
-    return path.read_text().splitlines() if path.exists() else []
-
-
-@pytest.mark.parametrize(
-    ("status", "arguments"), [(0, ()), (0, ("--seeds", "0,1")), (1, ()), (143, ())]
-)
-def test_a_job_that_ends_by_itself_is_not_queued_again(status, arguments, tmp_path):
-    """With seeds, the workdir never has an evaluation."""
-    process = _start(tmp_path, first=status, arguments=arguments)
+@pytest.mark.parametrize("status", [0, 143])
+def test_a_job_that_ends_by_itself_is_not_queued_again(status, tmp_path):
+    process = _start(tmp_path, first=status)
     assert process.wait(timeout=20) == status
-    assert _requeued(tmp_path) == []
+    assert not (tmp_path / "scontrol").exists()
 
 
 @pytest.mark.parametrize(
-    ("status", "is_requeued"), [(0, True), (143, True), (1, False), (2, False)]
+    ("status", "is_requeued"), [(0, True), (143, True), (1, False)]
 )
 def test_a_job_at_its_time_limit_stops_and_is_queued_again(
     status, is_requeued, tmp_path
@@ -78,21 +70,21 @@ def test_a_job_at_its_time_limit_stops_and_is_queued_again(
     process.send_signal(signal.SIGUSR1)
     assert process.wait(timeout=20) == status
     assert (tmp_path / "scancel").read_text() == "--signal=TERM 7\n"
-    assert _requeued(tmp_path) == ["requeue 7"] * is_requeued
+    path = tmp_path / "scontrol"
+    requeued = path.read_text() if path.exists() else ""
+    assert requeued == "requeue 7\n" * is_requeued
 
 
-@pytest.mark.parametrize("config", ["radenet", "dinorade:rc"])
-def test_srun_starts_the_preset_with_all_resources(config, tmp_path):
-    given = {} if config == "radenet" else {"CONFIG": config}
+def test_srun_starts_the_preset_with_all_resources(tmp_path):
     extra = ["--seeds", "0,1,2", "--config.train.max_steps=100"]
-    process = _start(tmp_path, first=0, arguments=extra, **given)
+    process = _start(tmp_path, first=0, arguments=extra, CONFIG="dinorade:rc")
     assert process.wait(timeout=20) == 0
     words = (tmp_path / "arguments").read_text().splitlines()
     assert f"--cpus-per-task={DIRECTIVES['cpus-per-task']}" in words
     start = words.index("radejax")
     assert words[start : start + 2] == ["radejax", "train"]
     context = train.make_context("train", words[start + 2 :], resilient_parsing=True)
-    assert context.params["config"] == config
+    assert context.params["config"] == "dinorade:rc"
     assert context.params["roots"] == ("/disk1", "/disk2")
     assert context.params["records"] == "/disk1/records"
     assert context.params["seeds"] == (0, 1, 2)
