@@ -16,7 +16,6 @@ from radejax.config import (
     config_name,
     load_config,
     load_module,
-    parse_options,
     with_texts,
 )
 from radejax.core.errors import UserError
@@ -50,83 +49,15 @@ WHOLE = load_config("quickstart_fusion").with_fields(
 )
 """A config with all sections, in which all fields but `simulation.sequences` have values."""
 
-_WRONG: list[tuple[Any, str]] = [
-    (
-        0,
-        "model.decoder_width model.num_groups model.pad_multiple model.image.num_heads "
-        "decode.max_detections train.batch_size train.num_epochs train.max_steps "
-        "train.gradient_accumulation_steps train.log_every_steps train.checkpoints_to_keep "
-        "train.checkpoint_every_steps data.max_objects evaluation.batch_size",
-    ),
-    (
-        0.0,
-        "model.input_scale loss.heatmap_sigma_bins loss.gwd_tau train.learning_rate "
-        "train.gradient_clip_norm",
-    ),
-    (
-        1.0,
-        "model.heatmap_prior model.fusion.dropout train.ema_decay "
-        "train.final_learning_rate",
-    ),
-    (1.5, "decode.nms_iou data.mirror_probability train.max_steps"),
-    (1, "simulation.grid.num_range logging.wandb"),
-    ((), "classes model.widths evaluation.protocols"),
-    (
-        "other",
-        "model.name model.input_stem model.backbone loss.heatmap_sigma_mode "
-        "loss.gwd_transform train.schedule train.parameter_sharding data.format "
-        "data.label_version data.camera.projection simulation.output "
-        "simulation.camera_mode",
-    ),
-]
-WRONG: list[tuple[str, Any]] = [
-    *((field, value) for value, fields in _WRONG for field in fields.split()),
-    ("seed", 2**32),
-    ("classes", ("Sedan", "Sedan")),
-    ("classes", ("Tank",)),
-    ("model.num_classes", 4),
-    ("model.widths", (32, 0)),
-    ("model.pad_multiple", 2),
-    ("model.doppler_bins", "64"),
-    ("model.image.size", (720,)),
-    ("model.fusion.num_heads", 3),
-    ("model.query_grid.range_m", (0.0, NAN)),
-    ("loss.own_terms", ("focal",)),
-    ("loss.weights", {"giou": 1.0}),
-    ("loss.weights", {"focal": -1.0}),
-    ("loss.weights", {"focal": 0.0, "gwd": 0.0, "smooth_l1": 0.0}),
-    ("decode.roi", (0.0, 72.0)),
-    ("data.roots", ("",)),
-    ("data.visibility", ("X",)),
-    ("data.sequences", (1, 1)),
-    ("data.weather", ("mist",)),
-    *(("data.validation", value) for value in (0.1, (1.0,), (0.1, 0.2), (5, 5))),
-    ("data.camera.radar_from_lidar_m", (1.0, 2.0)),
-    ("evaluation.roi", (72.0, 0.0, -6.4, 6.4, -2.0, 6.0)),
-    ("evaluation.empty_frames", None),
-    *(("evaluation.iou_thresholds", value) for value in ((2.0,), (0.3, 0.3), (NAN,))),
-    ("logging.profile_steps", (5, 2)),
-    ("simulation.radar_from_lidar_m", (0.0, 0.0)),
-]
-
-
-def _refused(field: str, value: Any, named: str | None = None) -> None:
-    with pytest.raises(UserError) as refused:
-        WHOLE.with_fields({field: value})
-    message = str(refused.value)
-    assert re.match(rf"config\.{re.escape(named or field)}(\[\d+\])* is ", message)
-    assert "\n" not in message
-
-
-@pytest.mark.parametrize(("field", "value"), WRONG)
-def test_an_impossible_value_is_named(field: str, value: Any) -> None:
-    # A mapping changes the named weights only.
-    is_one = field == "loss.weights" and len(value) == 1 and "giou" not in value
-    _refused(field, value, "loss.weights.focal" if is_one else None)
-
 
 FIELDS = {name: value for name, value in WHOLE.fields() if value is not None}
 ANY_NUMBER = ("input_center", "radar_from_lidar_z_m", "layer_scale")
+
+
+def _check_rejected(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(UserError, match=rf"^config\.{message}") as rejected:
+        WHOLE.with_fields(fields)
+    assert "\n" not in str(rejected.value)
 
 
 @pytest.mark.parametrize("field", FIELDS)
@@ -138,51 +69,87 @@ def test_a_value_of_a_wrong_type_or_range_is_named(field: str) -> None:
     elif isinstance(value, float):
         wrong += [NAN, INF] + [-1.0] * (field.rpartition(".")[2] not in ANY_NUMBER)
     for other in wrong:
-        _refused(field, other)
+        _check_rejected({field: other}, rf"{re.escape(field)}(\[\d+\])* is ")
 
 
-def test_sections_and_fields_that_do_not_exist_are_named() -> None:
-    for fields, message in (
-        (
-            {"train.num_epoch": 3},
-            "train.num_epoch is not a field; did you mean config.t",
-        ),
-        ({"trian.batch_size": 3}, "trian is not a field; did you mean config.train"),
-        ({"model.image.kin": "vit"}, "model.image.kin is not a field"),
-        ({"train": 3}, "train is 3, expected "),
-        ({"model": 3}, "model is 3, expected "),
-        ({"simulation": "kradar"}, "simulation is 'kradar', expected "),
-    ):
-        with pytest.raises(UserError, match=rf"^config\.{re.escape(message)}"):
-            WHOLE.with_fields(fields)
-    with pytest.raises(UserError, match=r"^config\.train\.batch_size cannot be set"):
-        WHOLE.train.batch_size = 3
-    with pytest.raises(UserError, match=r"^config\.seed cannot be set.*replace"):
-        WHOLE.seed = 3
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("classes", ("Sedan", "Sedan")),
+        ("classes", ("Tank",)),
+        ("model.num_classes", 4),
+        ("model.pad_multiple", 2),
+        ("model.image.hidden_size", 20),
+        ("model.image.size", (8, 48)),
+        ("model.fusion.num_heads", 3),
+        ("model.query_grid.elevation_deg", (-1.0, 0.0, 1.0)),
+        ("loss.own_terms", ("focal",)),
+        ("loss.weights", {"focal": 0.0, "gwd": 0.0, "smooth_l1": 0.0}),
+        ("decode.roi", (0.0, 72.0)),
+        ("data.roots", ("",)),
+        ("data.visibility", ("X",)),
+        ("data.sequences", (1, 1)),
+        ("data.weather", ("mist",)),
+        *(("data.validation", value) for value in (0.1, (1.0,), (0.1, 0.2), (5, 5))),
+        ("data.camera.radar_from_lidar_m", (1.0, 2.0)),
+        ("evaluation.protocols", ("other",)),
+        ("evaluation.roi", (72.0, 0.0, -6.4, 6.4, -2.0, 6.0)),
+        *(("evaluation.iou_thresholds", value) for value in ((2.0,), (0.3, 0.3))),
+        ("logging.profile_steps", (5, 2)),
+        ("simulation.radar_from_lidar_m", (0.0, 0.0)),
+    ],
+)
+def test_a_value_that_its_type_allows_is_named(field: str, value: Any) -> None:
+    _check_rejected({field: value}, rf"{re.escape(field)}(\[\d+\])* is ")
 
 
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"train.best_metric": "map_3d_iou70"}, None),  # no validation, no best one
+        ({"train.num_epoch": 3}, "train.num_epoch is not a field; did you mean conf"),
+        ({"trian.batch_size": 3}, "trian is not a field; did you mean config.train"),
+        ({"model.image.kin": "vit"}, "model.image.kin is not a field"),
+        ({"train": 3}, "train is 3, expected "),
+        ({"model": 3}, "model is 3, expected "),
+        ({"simulation": "kradar"}, "simulation is 'kradar', expected "),
         (
             {"train.best_metric": "map_3d_iou70", "train.evaluate_every_epochs": 1},
             "train.best_metric is 'map_3d_iou70', expected one of .*map_bev_iou30",
         ),
+        ({"model.doppler_bins": 64}, "model.doppler_bins is 64, expected 16, as conf"),
         (
-            {"model.doppler_bins": 64},
-            "model.doppler_bins is 64, expected 16, as config",
+            {"model.doppler_bins": 0, "model.elevation_bins": 0},
+            "model.elevation_bins is 0, expected above 0 if config.model.doppler_bins",
         ),
         (
-            {"classes": ("Sedan",)},
-            "model.num_classes is 5, expected 1, the number of config.classes",
+            {"model.elevation_bins": 0},
+            "model.fusion.weighting is 'mlp', expected 'off'",
         ),
-        ({"classes": ("Sedan",), "model.num_classes": 1}, None),
+        (
+            {"model.num_groups": 64},
+            r"model.widths\[0\] is 32, expected a multiple of n",
+        ),
+        (
+            {"model.num_groups": 32, "model.heads": "default"},
+            r"model.decoder_width / 2 \(default heads\) is 16, expected a multiple",
+        ),
+        (
+            {"model.image.kind": "resnet50"},
+            "model.image.freeze is False, expected True",
+        ),
+        (
+            {
+                "model.image.kind": "resnet50",
+                "model.image.freeze": True,
+                "model.image.size": (30, 48),
+            },
+            r"model.image.size is \(30, 48\), .* multiples of 16",
+        ),
+        ({"classes": ("Sedan",)}, "model.num_classes is 5, expected 1, the number of"),
         (
             {"train.learning_rate": 1e-5},
             "train.final_learning_rate is .*, expected at most config.train.learning_rate",
         ),
-        ({"train.learning_rate": 1e-5, "train.final_learning_rate": 0.0}, None),
         (
             {"simulation.scenes": "labels.zip", "simulation.vru_density_scale": 2.0},
             "simulation.vru_density_scale is 2.0, expected 1",
@@ -194,20 +161,76 @@ def test_sections_and_fields_that_do_not_exist_are_named() -> None:
     ],
 )
 def test_what_one_field_requires_of_another(
-    fields: dict[str, Any], message: str | None
+    fields: dict[str, Any], message: str
 ) -> None:
-    if message is None:
-        assert dict(WHOLE.with_fields(fields).fields()).items() >= fields.items()
-        return
-    with pytest.raises(UserError, match=rf"^config\.{message}"):
-        WHOLE.with_fields(fields)
+    _check_rejected(fields, message)
 
 
-def test_a_model_has_the_options_of_its_class() -> None:
-    config = Config().replace(model={"name": "dinorade"})
-    assert config.model == DinoRadeOptions()
-    with pytest.raises(UserError, match=r"^config\.model\.image is not a field"):
-        Config().with_fields({"model.image.kind": "vit"})
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"train.best_metric": "map_3d_iou70"},  # no validation, no best one
+        {"classes": ("Sedan",), "model.num_classes": 1},
+        {"train.learning_rate": 1e-5, "train.final_learning_rate": 0.0},
+        {
+            "model.elevation_bins": 0,
+            "model.fusion.weighting": "off",
+            "simulation": None,
+        },
+    ],
+)
+def test_fields_that_fit_each_other(fields: dict[str, Any]) -> None:
+    assert dict(WHOLE.with_fields(fields).fields()).items() >= fields.items()
+
+
+def _set(section: Any, field: str) -> None:
+    setattr(section, field, 3)
+
+
+def test_other_user_errors(tmp_path: pathlib.Path) -> None:
+    mine, other = tmp_path / "mine.py", tmp_path / "other.py"
+    mine.write_text("x = 1\n")
+    other.write_text("def get_config(arg=None): return {'seed': 1}\n")
+    plain = Config()
+    for call, message in (
+        (lambda: _set(WHOLE.train, "batch_size"), r"config\.train\.batch_size cannot"),
+        (lambda: _set(WHOLE, "seed"), r"config\.seed cannot be set.*replace"),
+        (
+            lambda: plain.with_fields({"model.image.kind": "vit"}),
+            "image is not a field",
+        ),
+        (lambda: load_config("radenet:base,stem"), "'base' and 'stem' exclude each"),
+        (lambda: load_config("radenet:big"), r"unknown config option 'big'; available"),
+        (lambda: load_config(f"{mine}:word"), r"mine\.py has no function get_config"),
+        (
+            lambda: load_config(str(other)),
+            r"get_config\(\) is {'seed': 1}, expected a C",
+        ),
+        (lambda: load_config(f"{tmp_path}/radenet"), r"a \.py file.*mean radenet\?"),
+        (
+            lambda: load_config("mine/radnet.py"),
+            r"no such .* a \.py file.*mean radenet",
+        ),
+        (
+            lambda: with_texts(plain, {"train": "1"}),
+            "config.train is not a field of th",
+        ),
+        (
+            lambda: with_texts(plain, {"train.batchsize": "1"}),
+            "config.train.batch_size?",
+        ),
+        (
+            lambda: with_texts(plain, {"train.batch_size": "2.5"}),
+            "is 2.5, expected an i",
+        ),
+        (lambda: with_texts(plain, {"model.input_stem": "1"}), "is 1, expected a bool"),
+        (
+            lambda: with_texts(plain, {"train.learning_rate": "((((" * 300}),
+            "expected a number",
+        ),
+    ):
+        with pytest.raises(UserError, match=message):
+            call()
 
 
 # Presets -----------------------------------------------------------------------------
@@ -234,10 +257,8 @@ def test_every_preset_can_be_built_and_stored_as_json(name: str) -> None:
         config = load_config(f"{name}:{words}")
         assert Config(**json.loads(config.model_dump_json())) == config
         assert models.build(config.model).options == config.model
-    if name in ("radenet", "dinorade"):
-        assert (
-            len(choices) > 40
-        )  # every row with the presets of the paper and the released code
+    if name in ("radenet", "dinorade"):  # every row with both presets
+        assert len(choices) > 40
 
 
 @pytest.mark.parametrize(
@@ -254,39 +275,7 @@ def test_fields_of_presets(name: str, field: str, expected: Any) -> None:
     assert dict(load_config(name).fields())[field] == expected
 
 
-def test_options_of_a_config_are_of_different_groups() -> None:
-    assert parse_options("b, a", ("a",), ("b", "c")) == ["a", "b"]
-    assert parse_options(None, ("a",)) == [None]
-    for words, message in (
-        ("base,stem", "'base' and 'stem' exclude each other"),
-        ("big", r"unknown config option 'big'; available"),
-    ):
-        with pytest.raises(UserError, match=message):
-            load_config(f"radenet:{words}")
-
-
 # Files and texts ---------------------------------------------------------------------
-
-
-def test_a_file_that_is_no_config_is_named(tmp_path: pathlib.Path) -> None:
-    (tmp_path / "mine.py").write_text("x = 1\n")
-    (tmp_path / "other.py").write_text("def get_config(arg=None): return {'seed': 1}\n")
-    for name, message in (
-        (f"{tmp_path / 'mine.py'}:word", r"mine\.py has no function get_config"),
-        (
-            f"{tmp_path / 'other.py'}",
-            r"get_config\(\) is {'seed': 1}, expected a Config",
-        ),
-        (str(tmp_path / "radenet"), r"no such .* a \.py file.*mean radenet\?"),
-        ("configs_of_mine/radnet.py", r"no such .* a \.py file.*mean radenet\?"),
-    ):
-        with pytest.raises(UserError, match=message):
-            load_config(name)
-
-
-def test_names_of_runs() -> None:
-    assert config_name("configs/quickstart.py") == "quickstart"
-    assert config_name("a/b/radenet.py:stem,sedan") == "radenet-stem-sedan"
 
 
 @pytest.mark.parametrize(
@@ -322,27 +311,15 @@ def test_a_text_becomes_the_value_of_a_field(
     assert type(found) is type(expected)
 
 
-def test_texts_are_set_together() -> None:
+def test_texts_are_set_together_and_models_have_the_options_of_their_class() -> None:
     texts = {"classes": "Sedan", "model.num_classes": "1"}
     assert with_texts(Config(), texts).classes == ("Sedan",)
+    assert Config().replace(model={"name": "dinorade"}).model == DinoRadeOptions()
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "message"),
-    [
-        ("train.batch_size", "many", "is 'many', expected an integer"),
-        ("train.batch_size", "2.5", "is 2.5, expected an integer"),
-        ("train.batch_size", "true", "is True, expected an integer"),
-        ("model.input_stem", "1", "is 1, expected a boolean"),
-        ("train", "1", "config.train is not a field of this config"),
-        ("train.batchsize", "1", "did you mean config.train.batch_size?"),
-        ("train.learning_rate", "((((" * 300, "expected a number"),
-    ],
-)
-def test_other_texts_are_rejected_by_name(name: str, text: str, message: str) -> None:
-    with pytest.raises(UserError, match=r"^config\.train|^config\.model") as refused:
-        with_texts(Config(), {name: text})
-    assert message in str(refused.value)
+def test_names_of_runs() -> None:
+    assert config_name("configs/quickstart.py") == "quickstart"
+    assert config_name("a/b/radenet.py:stem,sedan") == "radenet-stem-sedan"
 
 
 def test_data_paths_differ_from_machine_to_machine() -> None:

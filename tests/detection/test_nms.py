@@ -33,16 +33,6 @@ def overlap_matrix(boxes, threshold):
     return bev_iou(boxes.astype(np.float64), boxes) >= threshold
 
 
-def test_chain_by_hand():
-    # Each box overlaps the next: the first suppresses the second, which then cannot
-    # suppress the third.
-    boxes = np.zeros((4, 7), np.float32)
-    boxes[:, 0] = [0, 2, 4, 30]
-    boxes[:, 3:6] = 4
-    keep = nms(boxes, jnp.array([True, True, True, False]), 0.3)
-    assert keep.tolist() == [True, False, True, False]
-
-
 def test_threshold_is_inclusive():
     boxes = np.zeros((2, 7), np.float32)
     boxes[:, 3:6] = [3.0, 2, 1]

@@ -8,8 +8,6 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.options import DinoRadeOptions, RadeNetOptions
 from radejax.models.radenet import RadeNet
 
-from .. import small_models as small
-
 GRID = RadarGrid.reduced(num_doppler=2, num_range=13, num_elevation=2, num_azimuth=11)
 
 
@@ -40,20 +38,3 @@ class OwnOptions(RadeNetOptions):
 
 class Own(RadeNet):
     options: OwnOptions
-
-
-def test_an_axis_may_have_no_channels_but_not_both() -> None:
-    options = small.radar_config().model
-    assert options.replace(elevation_bins=0).doppler_bins == 2
-    assert options.replace(doppler_bins=0).elevation_bins == 3
-    with pytest.raises(UserError, match=r"elevation_bins is 0, expected above 0 if"):
-        options.replace(elevation_bins=0, doppler_bins=0)
-    with pytest.raises(UserError, match=r"doppler_bins is -1, expected an integer"):
-        options.replace(doppler_bins=-1)
-
-
-def test_elevation_weights_need_elevation_channels() -> None:
-    options = small.camera_config().model
-    with pytest.raises(UserError, match=r"weighting is 'mlp', expected 'off' without"):
-        options.replace(elevation_bins=0)
-    options.replace(elevation_bins=0, fusion={"weighting": "off"})

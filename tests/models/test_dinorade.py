@@ -186,17 +186,6 @@ def test_only_a_frozen_backbone_has_no_gradient(is_frozen):
     assert not model.is_frozen("backbone/stem/mix/conv/kernel")
 
 
-def test_resnet_in_place_of_the_transformer():
-    model = small(**{"image.kind": "resnet50", "image.resnet_width": 4})
-    variables = jax.eval_shape(model.init, jax.random.key(0), *batch())
-    assert model.feature_shape == (2, 3, 64)
-    maps = jax.eval_shape(model.apply, variables, *batch())
-    chex.assert_shape(maps.heatmap_logits, (B, R, A, 2))
-    # The last stage is trained and lies outside what is frozen.
-    assert "block_3" in variables["params"]["image_neck"]
-    assert "image_backbone" not in variables["batch_stats"]
-
-
 @pytest.mark.parametrize(
     ("variant", "trained", "frozen"),
     [
@@ -237,34 +226,3 @@ def test_images_of_another_size_are_rejected():
     ):
         with pytest.raises(UserError, match=message):
             jax.eval_shape(model.apply, variables, projection, *arguments)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"fusion.depth": 3}, r"config.model.fusion.depth is not a field"),
-        (
-            {"query_grid.range_m": (1.0,)},
-            r"config.model.query_grid.range_m is \(1.0,\)",
-        ),
-        ({"image.size": (8, 48)}, r"image.size is \(8, 48\), .* at least 16 pixels"),
-        (
-            {"image.kind": "resnet50", "image.size": (30, 48)},
-            r"image.size is \(30, 48\), .* multiples of 16",
-        ),
-        ({"image.hidden_size": 20}, r"hidden_size is 20, .* multiple of 4 .* 2 heads"),
-        ({"fusion.num_heads": 3}, r"fusion.num_heads is 3, expected a divisor"),
-        (
-            {"fusion.out_of_view": "official"},
-            r"size is \(32, 48\), .* leaves out 280 pixels",
-        ),
-        (
-            {"image.kind": "resnet50", "image.freeze": False},
-            r"freeze is False, expected True for a ResNet",
-        ),
-        ({"image": 3}, r"config.model.image is 3, expected"),
-    ],
-)
-def test_impossible_configs_are_rejected(changes, message):
-    with pytest.raises(UserError, match=message):
-        small(**changes)

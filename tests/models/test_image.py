@@ -99,27 +99,6 @@ def test_a_trained_trunk_is_the_frozen_one_of_its_statistics():
     assert float(jnp.abs(params["stem_norm"]["mean"]).min()) > 0
 
 
-def scattered(x, kernel, bias):
-    """The definition: every input spreads its 4x4 kernel, two outputs apart."""
-    b, height, width, _ = x.shape
-    out = np.zeros((b, 2 * height + 2, 2 * width + 2, kernel.shape[-1]))
-    for i in range(height):
-        for j in range(width):
-            spread = np.einsum("bc,klcd->bkld", x[:, i, j], kernel)
-            out[:, 2 * i : 2 * i + 4, 2 * j : 2 * j + 4] += spread
-    return out[:, 1:-1, 1:-1] + bias  # padding 1 cuts the border
-
-
-def test_transposed_convolution_follows_its_definition():
-    rng = np.random.default_rng(0)
-    x = rng.standard_normal((2, 3, 4, 5)).astype(np.float32)
-    kernel = rng.standard_normal((4, 4, 5, 6)).astype(np.float32)
-    bias = rng.standard_normal(6).astype(np.float32)
-    params = {"kernel": kernel, "bias": bias}
-    out = jax.jit(TransposedConv(6).apply)({"params": params}, x)
-    np.testing.assert_allclose(out, scattered(x, kernel, bias), atol=1e-5)
-
-
 def test_shapes_and_running_statistics():
     neck = CameraNeck(8)
     rng = np.random.default_rng(0)

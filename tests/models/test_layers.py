@@ -1,4 +1,4 @@
-"""Tests of `radejax.models.layers`; torch's numbers are in `released.npz`."""
+"""Tests of `radejax.models.layers`; weights/test_radenet_torch.py has torch's numbers."""
 
 import chex
 import jax
@@ -9,49 +9,10 @@ import pytest
 from radejax.models.layers import (
     Conv,
     Dense,
-    DoubleConvResidual,
     GroupNorm,
     Upsample,
-    max_pool,
     uniform_fan_in,
 )
-
-DOUBLE = {
-    "shortcut": "adjust_input",
-    "conv_1/conv": "double_conv.0.single_conv.0",
-    "conv_1/norm": "double_conv.0.single_conv.1",
-    "conv_2/conv": "double_conv.1.single_conv.0",
-    "conv_2/norm": "double_conv.1.single_conv.1",
-}
-
-
-@pytest.mark.parametrize(
-    ("case", "module", "names"),
-    [
-        ("double_conv_residual", DoubleConvResidual(64, 32), DOUBLE),
-        ("upsample", Upsample(16), {"": "upsample"}),
-    ],
-)
-def test_parts_equal_the_official_ones(
-    case, module, names, module_case, run_like_torch
-):
-    x, expected = module_case(case)
-    actual = run_like_torch(module, names, x)
-    np.testing.assert_allclose(actual, expected, atol=1e-5)
-
-
-def test_upsample_places_each_tap_at_its_corner():
-    x = jnp.array([[[[1.0], [10.0]]]])  # 1 x 2 bins
-    kernel = jnp.array([[1.0, 2.0], [3.0, 4.0]]).reshape(2, 2, 1, 1)
-    variables = {"params": {"kernel": kernel, "bias": jnp.array([0.5])}}
-    y = Upsample(1).apply(variables, x)[0, ..., 0]
-    expected = [[1.5, 2.5, 10.5, 20.5], [3.5, 4.5, 30.5, 40.5]]
-    np.testing.assert_array_equal(y, expected)
-
-
-def test_max_pool_by_hand():
-    x = jnp.array([[1.0, 2.0, 5.0, 0.0], [3.0, -1.0, -7.0, 4.0]]).reshape(1, 2, 4, 1)
-    np.testing.assert_array_equal(max_pool(x)[0, ..., 0], [[3.0, 5.0]])
 
 
 @pytest.mark.parametrize("offset", [0.0, 1000.0])
@@ -117,12 +78,3 @@ def test_initial_weights_and_biases_fill_torchs_interval(module, fan_in):
     bound = fan_in**-0.5
     for leaf in params.values():
         assert bound * 0.9 < np.abs(leaf).max() <= bound
-
-
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
-def test_parameters_stay_float32_and_output_has_the_dtype(dtype):
-    module = DoubleConvResidual(16, 8, dtype=dtype)
-    x = jnp.ones((1, 4, 4, 8))
-    variables = module.init(jax.random.key(0), x)
-    assert {leaf.dtype for leaf in jax.tree.leaves(variables)} == {jnp.dtype("float32")}
-    assert module.apply(variables, x).dtype == dtype

@@ -30,15 +30,6 @@ def apply(small):
     return jax.jit(models.build(small).apply)
 
 
-def test_padding_inside_equals_padding_outside(variables, apply):
-    x = jax.random.uniform(jax.random.key(0), (1, 21, 14, 13))
-    maps = apply(variables, x)
-    assert maps.heatmap_logits.shape == (1, 24, 16, 3)
-    assert maps.box_params.shape == (1, 24, 16, 8)
-    outside = apply(variables, jnp.pad(x, ((0, 0), (0, 3), (0, 2), (0, 0))))
-    chex.assert_trees_all_close(maps, outside, atol=1e-5)
-
-
 def test_cropped_maps_are_the_padded_ones_cut(small, variables, apply):
     x = jax.random.uniform(jax.random.key(0), (1, 21, 14, 13))
     maps = apply(variables, x)
@@ -127,18 +118,3 @@ def test_two_frames_have_twice_the_channels_of_the_first_convolution_only(small)
         assert one.keys() == two.keys()
     with pytest.raises(UserError, match=r"\[B, R, A, 26\] .* got \(1, 8, 8, 13\)"):
         models.build(small, 2).init(jax.random.key(0), jnp.zeros((1, 8, 8, 13)))
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"pad_multiple": 4}, r"pad_multiple is 4, expected a multiple of 8 for 3 l"),
-        ({"num_groups": 32}, r"widths\[0\] is 16, expected a multiple of num_groups"),
-        ({"num_groups": 16, "heads": "default"}, r"decoder_width / 2 .* is 8"),
-        ({"num_groups": 16, "input_stem": True}, r"widths\[0\] / 2 .* is 8"),
-        ({"widths": (16, "a", 64)}, r"widths\[1\] is 'a', expected an integer"),
-    ],
-)
-def test_impossible_values_are_named(small, changes, message):
-    with pytest.raises(UserError, match=message):
-        small.replace(**changes)

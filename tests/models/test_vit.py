@@ -56,35 +56,6 @@ def test_blocked_attention_has_the_gradients_of_the_plain_one():
     chex.assert_trees_all_close(blocked, plain, atol=5e-5)
 
 
-def test_rotary_angles_by_hand():
-    cos, sin = vit.rotary_angles(1, 2, 8, theta=16.0)
-    # One row: y = 0. Columns: x = -0.5 and 0.5; frequencies 1 and 16^-0.5 = 1/4.
-    angle = 2 * np.pi * np.array([[0, 0, -0.5, -0.125], [0, 0, 0.5, 0.125]])
-    angle = np.concatenate([angle, angle], -1)
-    np.testing.assert_allclose(cos, np.cos(angle), atol=1e-6)
-    np.testing.assert_allclose(sin, np.sin(angle), atol=1e-6)
-
-
-def test_rotation_leaves_norms_and_the_prefix():
-    x = np.random.default_rng(0).standard_normal((2, 3 + 6, 2, 8)).astype(np.float32)
-    rope = vit.rotary_angles(2, 3, 8)
-    turned = vit.rotate(jnp.asarray(x), rope, 3)
-    np.testing.assert_array_equal(turned[:, :3], x[:, :3])
-    np.testing.assert_allclose(
-        np.linalg.norm(turned, axis=-1), np.linalg.norm(x, axis=-1), rtol=1e-5
-    )
-    assert np.abs(turned[:, 3:] - x[:, 3:]).max() > 0.5
-
-
-def test_scores_depend_on_relative_position_only():
-    x = np.random.default_rng(1).standard_normal((1, 1, 1, 8)).astype(np.float32)
-    same = jnp.asarray(np.broadcast_to(x, (1, 25, 1, 8)))
-    turned = vit.rotate(same, vit.rotary_angles(5, 5, 8), 0).reshape(5, 5, 8)
-    scores = np.einsum("abc,dec->abde", turned, turned)
-    np.testing.assert_allclose(scores[0, 1, 2, 4], scores[1, 0, 3, 3], rtol=1e-5)
-    assert abs(scores[0, 1, 2, 4] - scores[0, 1, 2, 3]) > 1e-3
-
-
 def test_images_are_resized_to_the_nearest_multiples_of_the_patch_size():
     model = ViT(TINY)
     assert TINY.grid(8, 12) == (2, 3)
