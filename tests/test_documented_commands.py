@@ -3,7 +3,6 @@
 import contextlib
 import functools
 import io
-import json
 import pathlib
 import re
 import runpy
@@ -18,8 +17,6 @@ from radejax.cli import entry, main
 from radejax.cli.evaluate import evaluate
 from radejax.cli.train import train
 from radejax.config import load_config, with_texts
-
-from . import small_models as small
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 PAGES = [
@@ -157,33 +154,3 @@ def _help(script: str) -> str:
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_a_script_explains_itself(script: str) -> None:
     assert _help(script).lower().startswith("usage: ")
-
-
-# Run for real, on two frames --------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
-    """Two frames of one sequence, made by `radejax simulate`."""
-    folder = tmp_path_factory.mktemp("commands")
-    counts = {"train_sequences": 1, "test_sequences": 0}
-    settings = load_config("quickstart").replace(simulation=counts)
-    config = small.write_config(folder / "tiny.py", settings)
-    out = folder / "data"
-    _run("simulate", "--config", config, "--frames", 2, "--out", out)
-    return out
-
-
-def _run(*arguments: object) -> click.testing.Result:
-    words = [str(argument) for argument in arguments]
-    result = click.testing.CliRunner().invoke(main.main, words)
-    assert result.exit_code == 0, result.output
-    return result
-
-
-def test_data_are_checked_and_preprocessed_once(
-    root: pathlib.Path, tmp_path: pathlib.Path
-) -> None:
-    assert json.loads(_run("data", "check", root, "--json").stdout)
-    for counts in ("0 were done, 2 preprocessed", "2 were done, 0 preprocessed"):
-        assert counts in _run("preprocess", root, "--out", tmp_path / "records").stdout

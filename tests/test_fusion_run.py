@@ -16,9 +16,7 @@ from radejax.cli.main import main
 from radejax.config import load_config, load_module
 from radejax.core.errors import DataError, UserError
 from radejax.data.cameras import require_images
-from radejax.data.kradar.radar_files import key_of
 from radejax.data.records import open_embeddings
-from radejax.inference.detect_files import detect_files, find_inputs
 from radejax.inference.detector import Detector
 from radejax.inference.predict import predict_dataset
 from radejax.inference.saved import load_model
@@ -141,6 +139,10 @@ def test_frozen_backbone_is_in_no_checkpoint_and_comes_back(data, from_images):
     names += [path.read_text() for path in stored.rglob("_METADATA")]
     assert "image_neck" in "".join(names)
     assert "image_backbone" not in "".join(names)
+    path = from_images / "evaluation" / "camera_share.json"
+    share = json.loads(path.read_text())["all"]
+    assert share["frames"] == 4
+    assert 0 < share["mean"] < 1
 
 
 def assert_same(found, wanted):
@@ -158,13 +160,6 @@ def test_training_from_embeddings_is_the_same(from_images, from_embeddings, data
         for run in (from_embeddings, from_images)
     ]
     assert reports[0] == reports[1]
-
-
-def test_evaluation_shows_the_share_of_the_camera(from_images):
-    path = from_images / "evaluation" / "camera_share.json"
-    share = json.loads(path.read_text())["all"]
-    assert share["frames"] == 4
-    assert 0 < share["mean"] < 1
 
 
 def test_example_compares_fusion_and_radar_by_the_lens(
@@ -265,38 +260,6 @@ def test_frames_without_image_are_counted_and_predicted_by_radar(
         own.images(blind)
 
 
-def test_detect_finds_the_images_by_the_labels(from_images, tmp_path):
-    frames = list(opened(from_images)[1].split("test"))
-    folder = frames[0].projection_path.parents[1]
-    root = tmp_path / "kradar"
-    others = [x.name for x in folder.parent.iterdir() if x.name.isdecimal()]
-    others.remove(folder.name)
-    shutil.copytree(folder.parent, root, ignore=shutil.ignore_patterns(*others))
-
-    def detect(name):
-        out = tmp_path / name
-        detector = Detector.from_workdir(from_images, score_threshold=0.0)
-        counts, _ = detect_files(detector, find_inputs(detector, [root]), out)
-        assert counts["frames"] == len(list(out.iterdir())) == len(frames)
-        key = key_of(frames[0].projection_path).replace("/", "_")
-        return counts["radar_only"], json.loads((out / f"{key}.json").read_text())
-
-    none_missing, seen = detect("seen")
-    assert none_missing == 0
-    detector = Detector.from_workdir(from_images, score_threshold=0.0)
-    files = [frames[0].camera_path], [frames[0].camera_calibration_path]
-    (expected,) = detector(frames[0].projection_path, *files).to_list()
-    found_x, expected_x = ([box["x"] for box in boxes] for boxes in (seen, expected))
-    assert found_x == pytest.approx(expected_x, abs=1e-3)
-    (root / folder.name / "cam-front" / frames[0].camera_path.name).unlink()
-    one_missing, blind = detect("blind")
-    assert one_missing == 1
-    assert blind != seen
-    for labels in (root / folder.name).glob("info_label*"):
-        shutil.rmtree(labels)
-    assert detect("unlabelled")[0] == len(frames)
-
-
 def test_other_data_without_cameras_are_an_error(data, from_images, tmp_path):
     other = shutil.copytree(data.folder, tmp_path / "other")
     shutil.rmtree(other / "records")
@@ -307,26 +270,18 @@ def test_other_data_without_cameras_are_an_error(data, from_images, tmp_path):
     assert not (other / "records").exists()
 
 
-def test_what_does_not_fit_is_rejected(data, from_images, embeddings, tmp_path):
-    config, radar = small_config(), load_config(f"{CONFIG}:radar")
+def test_embeddings_that_do_not_fit_are_rejected(data, embeddings, tmp_path):
+    config = small_config()
     paths = {"roots": (str(data.folder),), "records": str(data.folder / "records")}
     paths["embeddings"] = str(embeddings)
-
-    def load(config, folder=data.backbone):
-        return image_backbone.load_image_backbone(folder, build(config.model))
 
     def open_data(fields):
         changed = config.replace(data=paths).with_fields(fields)
         return Data(changed)
 
     plain = config.with_fields({"model.image.standardize": False}).model.image
-    deeper = config.with_fields({"model.image.num_layers": 12})
     (tmp_path / "records.json").write_text('{"shape": [2, 3]}')
     for call, message in (
-        (lambda: load(config, None), "--image-backbone FOLDER"),
-        (lambda: load(config, tmp_path), "lacks config.json"),
-        (lambda: load(deeper), "num_layers is 3 .* 12 here"),
-        (lambda: load(radar), "has no camera"),
         (
             lambda: open_embeddings(embeddings, plain.to_dict()),
             "standardize is True there and False here",
@@ -338,4 +293,3 @@ def test_what_does_not_fit_is_rejected(data, from_images, embeddings, tmp_path):
     ):
         with pytest.raises((UserError, DataError, FileNotFoundError), match=message):
             call()
-    assert load(radar, None) is None

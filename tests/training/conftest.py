@@ -78,7 +78,7 @@ def tiny() -> Tiny:
         model=RadeNetOptions(
             doppler_bins=2,
             elevation_bins=2,
-            widths=(8, 8, 16),
+            widths=(8, 8),
             decoder_width=8,
             num_groups=4,
             cbam="off",  # irrelevant for the loop, and compiles faster
