@@ -11,6 +11,7 @@ import numpy as np
 
 from radejax import Detector, models
 from radejax.config import Config, load_config
+from radejax.core.structures import Batch
 from radejax.geometry.camera import CameraCalibration, stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.saved import SavedModel
@@ -142,6 +143,26 @@ def projections(count: int) -> np.ndarray:
 def images(count: int) -> np.ndarray:
     rng = np.random.default_rng(1)
     return rng.integers(0, 256, (count, *IMAGE_SIZE, 3), dtype=np.uint8)
+
+
+def labelled_batch(projection: np.ndarray, image: np.ndarray | None = None) -> Batch:
+    """Frames with two sedans each, and their images from the small camera."""
+    count, rng = len(projection), np.random.default_rng(0)
+    boxes = np.zeros((count, 3, 8), np.float32)
+    boxes[..., 0] = rng.uniform(5, 25, (count, 3))
+    boxes[..., 3:] = (4.4, 1.9, 1.6, 0.0, 1.0)
+    batch = Batch(
+        projection=projection,
+        boxes=boxes,
+        classes=np.zeros((count, 3), np.int32),
+        is_valid=np.tile([True, True, False], (count, 1)),
+        frame=np.arange(count, dtype=np.int32),
+    )
+    if image is None:
+        return batch
+    height, width = image.shape[1:3]
+    camera = calibration(width=width, height=height).camera()
+    return batch.replace(image=image, camera=stack_cameras([camera] * count))
 
 
 def official_calibration() -> CameraCalibration:

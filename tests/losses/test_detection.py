@@ -350,8 +350,7 @@ def test_nms_matching_chooses_boxes_as_decoding_does(changes, num_matched):
     batch = batch_of(boxes, np.array([[0, 1]]), np.ones((1, 2), bool))
     decoding = DecodeOptions(score_threshold=0.5, **changes)
     maps = DetectionMaps(jnp.asarray(logits), jnp.asarray(params))
-    options = LossOptions(assignment="nms")
-    _, parts = detection_loss(maps, batch, GRID, options, decoding)
+    (_, parts), _ = loss_and_grad(maps, batch, decoding, assignment="nms")
     assert int(parts["num_matched"]) == num_matched
 
 

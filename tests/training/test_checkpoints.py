@@ -69,15 +69,20 @@ def _read(folder: pathlib.Path, step: int | None = None) -> tuple[Any, dict, int
         return checkpoints.restore_variables(step)
 
 
-@pytest.fixture
-def folder(tmp_path: pathlib.Path) -> pathlib.Path:
-    """Checkpoints of steps 1, 2 and 3."""
-    iterator = _iterator()
-    with Checkpoints(tmp_path / "checkpoints", max_to_keep=None) as checkpoints:
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+    iterator, folder = _iterator(), tmp_path_factory.mktemp("saved")
+    with Checkpoints(folder, max_to_keep=None) as checkpoints:
         for step in (1, 2, 3):
             next(iterator)
             checkpoints.save(step, _state(step), iterator, info={"config": {"a": 1.5}})
-    return tmp_path / "checkpoints"
+    return folder
+
+
+@pytest.fixture
+def folder(saved: pathlib.Path, tmp_path: pathlib.Path) -> pathlib.Path:
+    """Checkpoints of steps 1, 2 and 3."""
+    return shutil.copytree(saved, tmp_path / "checkpoints")
 
 
 def test_state_position_and_info_come_back(folder: pathlib.Path) -> None:

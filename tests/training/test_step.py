@@ -6,10 +6,8 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 
-from radejax.core import devices
 from radejax.core.structures import to_float
 from radejax.detection.decode import DecodeOptions, decode
 from radejax.geometry.boxes import boxes7_from_8
@@ -103,51 +101,6 @@ def test_a_step_without_finite_loss_changes_nothing_and_is_counted(
     again, metrics = step(after, batch, RNG)
     assert int(metrics["skipped"]) == 1
     assert int(again.num_skipped_in_row) == 0
-
-
-def test_a_batch_without_objects_is_a_normal_step(
-    tiny: Tiny, start: Any, step: Any
-) -> None:
-    batch = _batch(tiny)
-    empty = batch.replace(is_valid=np.zeros_like(batch.is_valid))
-    after, metrics = step(start[1], empty, RNG)
-    chex.assert_tree_all_finite(after.params)
-    chex.assert_tree_all_finite(metrics)
-    assert int(metrics["skipped"]) == 0
-
-
-@pytest.fixture(scope="module")
-def plain(tiny: Tiny, start: Any) -> tuple[Any, Any, Any]:
-    """Gradient descent, whose step is as exact as the gradient; its step on one device.
-
-    Adam divides by the gradient's size, so that rounding of a gradient that is zero
-    (a bias before a normalization) becomes a whole step.
-    """
-    optimizer = optax.sgd(0.1)
-    variables = {"params": start[1].params}
-    state = create_state(variables, optimizer, use_ema=True)
-    return optimizer, state, jax.jit(_make(tiny, optimizer))
-
-
-@pytest.mark.cpu_only
-@pytest.mark.parametrize("parameters", ["replicated", "fsdp"])
-def test_eight_devices_equal_one(tiny: Tiny, plain: Any, parameters: str) -> None:
-    optimizer, state, step = plain
-    expected, expected_metrics = step(state, _batch(tiny, 8), RNG)
-    mesh = devices.make_mesh(8)
-    placement = devices.state_sharding(state, mesh, parameters, min_size=64)
-    if parameters == "fsdp":
-        assert any(not s.is_fully_replicated for s in jax.tree.leaves(placement.params))
-    sharded = jax.jit(
-        _make(tiny, optimizer), out_shardings=(placement, devices.replicated(mesh))
-    )
-    on_mesh = jax.device_put((state, RNG), (placement, devices.replicated(mesh)))
-    batch = devices.put_batch(_batch(tiny, 8), mesh)
-    program = sharded.lower(on_mesh[0], batch, on_mesh[1]).compile()
-    with jax.transfer_guard("disallow"):
-        actual, metrics = program(on_mesh[0], batch, on_mesh[1])
-    chex.assert_trees_all_close(metrics, expected_metrics, rtol=1e-4, atol=1e-5)
-    chex.assert_trees_all_close(actual.params, expected.params, rtol=1e-4, atol=1e-5)
 
 
 def test_bfloat16_keeps_parameters_moments_and_losses_in_float32(

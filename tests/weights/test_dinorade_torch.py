@@ -1,6 +1,5 @@
 """Tests of radejax.weights.dinorade_torch, against the released code's outputs."""
 
-import functools
 import json
 import pathlib
 
@@ -14,15 +13,11 @@ from radejax.config import load_config, load_module
 from radejax.core.errors import DataError, UserError
 from radejax.inference.saved import load_torch
 from radejax.models import build
-from radejax.models.fusion import Fusion
-from radejax.models.image import CameraNeck
-from radejax.models.lifting import WeightingNetwork, reference_points
+from radejax.models.lifting import reference_points
 from radejax.models.options import OFFICIAL_DINORADE, ViTOptions
 from radejax.models.vit import ViT
 from radejax.weights import dinorade_torch, dinov3_hf
 from radejax.weights.convert import (
-    from_torch,
-    shapes_of,
     to_torch_layout,
     torch_name,
     variable_shapes,
@@ -36,14 +31,9 @@ RECIPES = load_module(GOLDEN / "dinorade_make.py")
 
 @pytest.fixture(scope="module")
 def seeded(released):
-    """Function from the name of a part to its seeded tensors by official name."""
-
-    @functools.cache
-    def tensors(name):
-        shapes = json.loads(str(released(f"dinorade/{name}")["tensors"]))
-        return {n: RECIPES.seeded_tensor(n, tuple(s)) for n, s in shapes.items()}
-
-    return tensors
+    """Seeded tensors of the whole network by official name."""
+    shapes = json.loads(str(released("dinorade/end_to_end")["tensors"]))
+    return {n: RECIPES.seeded_tensor(n, tuple(s)) for n, s in shapes.items()}
 
 
 def load(content, **options):
@@ -52,90 +42,25 @@ def load(content, **options):
     return saved.model, saved.variables
 
 
-def part_from_torch(name, module, inputs, tensors, source, ignored=r"\Z"):
-    """Variables of a part of DinoRADE from the tensors of that part only."""
-    shapes = jax.eval_shape(module.init, jax.random.key(0), *inputs)
-    whole = {kind: {name: tree} for kind, tree in shapes.items()}
-    tensors = {f"{source}.{key}": value for key, value in tensors.items()}
-    names = dinorade_torch.rules("expanded", is_resnet=False)
-    found = from_torch(names, shapes_of(whole), tensors, source, ignored)
-    return {kind: tree[name] for kind, tree in found.items()}
-
-
 def released_geometry():
     camera = small_models.official_calibration().camera("pinhole")
     axes = OFFICIAL_DINORADE.query_grid
     return reference_points(camera, axes, 256, 112, 10, "official")
 
 
-def channels_last(x):
-    return np.ascontiguousarray(np.moveaxis(x, 1, -1))
-
-
-def sampled(file, ours, rows="rows", cols="cols"):
+def sampled(file, ours):
     """Rows and columns of our `[H, W, C]` map as the fixture has them."""
-    return ours[file[rows][:, None], file[cols]].transpose(2, 0, 1)
-
-
-def patch_tokens():
-    tokens = RECIPES.normal_input(121, (1, 3605, 384))
-    return tokens[:, 5:].reshape(1, 45, 80, 384)
-
-
-def radar_cube():
-    return channels_last(RECIPES.uniform_input(7, (1, 101, 256, 107), 0.6))
-
-
-def test_released_camera_neck(released, seeded):
-    file, neck = released("dinorade/camneck"), CameraNeck()
-    inputs = patch_tokens(), jnp.ones(1, bool)
-    tensors = seeded("camneck")
-    variables = part_from_torch("image_neck", neck, inputs, tensors, "image_neck")
-    out = jax.jit(neck.apply)(variables, *inputs)
-    chex.assert_shape(out, (1, 180, 320, 128))
-    out = sampled(file, np.asarray(out[0]))
-    np.testing.assert_allclose(out, file["output"], atol=2e-5)
-
-
-@pytest.mark.slow
-def test_released_fusion(released, seeded):
-    file, tensors = released("dinorade/fusion"), seeded("fusion")
-    named = {f"fusion.{name}": value for name, value in tensors.items()}
-    fields = dinorade_torch.infer_fusion(named, {})
-    assert fields["weighting"] == "cnn"
-    assert not fields["necks"]
-    module = Fusion(OFFICIAL_DINORADE.fusion.replace(**fields))
-    radar = channels_last(RECIPES.normal_input(122, (1, 128, 256, 112)))
-    camera = channels_last(RECIPES.normal_input(123, (1, 128, 180, 320)))
-    elevation = np.pad(radar_cube()[..., 64:], ((0, 0), (0, 0), (0, 5), (0, 0)))
-    inputs = radar, elevation, camera, released_geometry()
-    variables = part_from_torch(
-        *("image_fusion", module, inputs, tensors, "fusion"), r"fusion\.output_proj"
-    )
-
-    @jax.jit
-    def run(variables, *inputs):
-        return module.apply(variables, *inputs, mutable="intermediates")
-
-    out, state = run(variables, *inputs)
-    out, gate = np.asarray(out[0]), state["intermediates"]["camera_share"][0][0]
-    np.testing.assert_allclose(sampled(file, out), file["output"], atol=2e-4)
-    np.testing.assert_allclose(gate[::8, ::8], file["gate"], atol=1e-4)
-    weights = jax.jit(WeightingNetwork(10, "cnn").apply)(
-        {"params": variables["params"]["weighting"]}, elevation
-    )[0]
-    np.testing.assert_allclose(
-        sampled(file, np.asarray(weights), "elevation_rows", "elevation_cols"),
-        file["elevation_weights"],
-        atol=1e-5,
-    )
+    return ours[file["rows"][:, None], file["cols"]].transpose(2, 0, 1)
 
 
 def test_released_model_end_to_end(released, seeded):
     file = released("dinorade/end_to_end")
-    model, variables = load(seeded("end_to_end"))
-    inputs = radar_cube(), patch_tokens(), released_geometry()
-    maps = jax.jit(model.apply)(variables, *inputs)
+    model, variables = load(seeded)
+    radar = RECIPES.uniform_input(7, (1, 101, 256, 107), 0.6)
+    radar = np.ascontiguousarray(np.moveaxis(radar, 1, -1))
+    tokens = RECIPES.normal_input(121, (1, 3605, 384))
+    tokens = tokens[:, 5:].reshape(1, 45, 80, 384)
+    maps = jax.jit(model.apply)(variables, radar, tokens, released_geometry())
     heatmap = np.asarray(jax.nn.sigmoid(maps.heatmap_logits))[0]
     chex.assert_shape(heatmap, (256, 112, 5))
     np.testing.assert_allclose(sampled(file, heatmap), file["heatmap"], atol=5e-5)
@@ -144,7 +69,7 @@ def test_released_model_end_to_end(released, seeded):
 
 
 def test_loading_fills_the_model_exactly(seeded):
-    tensors = {f"module.{k}": v for k, v in seeded("end_to_end").items()}
+    tensors = {f"module.{k}": v for k, v in seeded.items()}
     nested = {"epoch": 3, "model": tensors}
     model, variables = load(nested, crop_output=True, num_heads=8)
     assert model.options.crop_output
@@ -169,7 +94,7 @@ def test_loading_fills_the_model_exactly(seeded):
 def tiny(seeded):
     """The tensors for a tiny transformer, without it."""
     neck = {"image_neck.channel_proj.weight": np.zeros((128, 96), np.float32)}
-    return seeded("end_to_end") | neck
+    return seeded | neck
 
 
 def test_image_backbone_with_adapters(tiny, make):
@@ -226,7 +151,7 @@ def test_other_content_is_rejected(tiny, monkeypatch):
 
 def test_resnet_in_place_of_the_transformer(seeded):
     """Its names are those of torchvision's in the released Sequential."""
-    tensors = seeded("end_to_end")
+    tensors = seeded
     tensors = {n: v for n, v in tensors.items() if not n.startswith("image_neck.")}
     config = load_config("dinorade:official,rcw_resnet50").model
     model = build(config)

@@ -90,13 +90,6 @@ def test_full_size_model(released, make, size, stream):
     np.testing.assert_allclose(tokens[file["token_index"]], expected, atol=TOLERANCE)
 
 
-def test_names_of_transformers_5_in_memory(tensors, make):
-    model = dinov3_hf.model_from_config(make.TINY_CONFIG)
-    plain = dinov3_hf.to_params(model, tensors)
-    prefixed = {f"model.{k}": v for k, v in tensors.items()}
-    chex.assert_trees_all_equal(dinov3_hf.to_params(model, prefixed), plain)
-
-
 def test_incomplete_or_corrupted_folders(folder, tmp_path):
     config, weights = folder / "config.json", folder / "model.safetensors"
     index = folder / "model.safetensors.index.json"
