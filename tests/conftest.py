@@ -221,6 +221,14 @@ def make() -> types.ModuleType:
 
 
 @pytest.fixture(scope="session")
+def radenet_golden() -> types.ModuleType:
+    """Module with seeded weights, configs and inputs of `models_radenet.npz`."""
+    from radejax.config import load_module
+
+    return load_module(GOLDEN / "models_radenet.py")
+
+
+@pytest.fixture(scope="session")
 def released() -> Callable[[str], dict[str, np.ndarray]]:
     """Function from a group of `tests/golden/released.npz` to its arrays."""
     arrays = dict(np.load(GOLDEN / "released.npz"))

@@ -121,22 +121,13 @@ def test_a_value_that_its_type_allows_is_named(field: str, value: Any) -> None:
             {"model.doppler_bins": 0, "model.elevation_bins": 0},
             "model.elevation_bins is 0, expected above 0 if config.model.doppler_bins",
         ),
-        (
-            {"model.elevation_bins": 0},
-            "model.fusion.weighting is 'mlp', expected 'off'",
-        ),
-        (
-            {"model.num_groups": 64},
-            r"model.widths\[0\] is 32, expected a multiple of n",
-        ),
+        ({"model.elevation_bins": 0}, "model.fusion.weighting is 'mlp', expected"),
+        ({"model.num_groups": 64}, r"model.widths\[0\] is 32, expected a multiple of"),
         (
             {"model.num_groups": 32, "model.heads": "default"},
             r"model.decoder_width / 2 \(default heads\) is 16, expected a multiple",
         ),
-        (
-            {"model.image.kind": "resnet50"},
-            "model.image.freeze is False, expected True",
-        ),
+        ({"model.image.kind": "resnet50"}, "model.image.freeze is False, expected"),
         (
             {
                 "model.image.kind": "resnet50",
@@ -195,34 +186,19 @@ def test_other_user_errors(tmp_path: pathlib.Path) -> None:
     for call, message in (
         (lambda: _set(WHOLE.train, "batch_size"), r"config\.train\.batch_size cannot"),
         (lambda: _set(WHOLE, "seed"), r"config\.seed cannot be set.*replace"),
-        (
-            lambda: plain.with_fields({"model.image.kind": "vit"}),
-            "image is not a field",
-        ),
+        (lambda: plain.with_fields({"model.image.kind": "vit"}), "image is not a"),
         (lambda: load_config("radenet:base,stem"), "'base' and 'stem' exclude each"),
         (lambda: load_config("radenet:big"), r"unknown config option 'big'; available"),
         (lambda: load_config(f"{mine}:word"), r"mine\.py has no function get_config"),
-        (
-            lambda: load_config(str(other)),
-            r"get_config\(\) is {'seed': 1}, expected a C",
-        ),
+        (lambda: load_config(str(other)), r"get_config\(\) is {'seed': 1}, expected"),
         (lambda: load_config(f"{tmp_path}/radenet"), r"a \.py file.*mean radenet\?"),
-        (
-            lambda: load_config("mine/radnet.py"),
-            r"no such .* a \.py file.*mean radenet",
-        ),
-        (
-            lambda: with_texts(plain, {"train": "1"}),
-            "config.train is not a field of th",
-        ),
+        (lambda: load_config("mine/radnet.py"), r"no such .* a \.py file.*mean"),
+        (lambda: with_texts(plain, {"train": "1"}), "config.train is not a field of"),
         (
             lambda: with_texts(plain, {"train.batchsize": "1"}),
             "config.train.batch_size?",
         ),
-        (
-            lambda: with_texts(plain, {"train.batch_size": "2.5"}),
-            "is 2.5, expected an i",
-        ),
+        (lambda: with_texts(plain, {"train.batch_size": "2.5"}), "is 2.5, expected"),
         (lambda: with_texts(plain, {"model.input_stem": "1"}), "is 1, expected a bool"),
         (
             lambda: with_texts(plain, {"train.learning_rate": "((((" * 300}),

@@ -101,12 +101,17 @@ def test_windows_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         runpy.run_path(str(PACKAGE / "__init__.py"))
 
 
-def test_import_and_help_do_not_load_jax() -> None:
+def test_commands_load_only_the_libraries_that_they_need() -> None:
     code = (
+        "import sys\n"
         "from radejax.cli.main import main\n"
         "main(['detect', '--help'], 'radejax', standalone_mode=False)\n"
-        "import sys\n"
-        "sys.exit(str(set(sys.modules) & {'jax', 'flax', 'matplotlib', 'numpy', 'absl'}))"
+        "after_help = {'jax', 'flax', 'matplotlib', 'numpy', 'absl'} & set(sys.modules)\n"
+        "from radejax import Detector\n"
+        "Detector.from_workdir('radejax/cli/demo_model')\n"
+        "after_model = {'orbax', 'grain', 'matplotlib'} & set(sys.modules)\n"
+        "sys.exit(str(after_help | after_model))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    command, root = [sys.executable, "-c", code], PACKAGE.parent
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True)
     assert done.stderr.strip() == "set()"

@@ -19,28 +19,12 @@ from radejax.training.checkpoints import Checkpoints
 
 from .. import small_models as small
 
-SIZES = {"doppler": 4, "range": 16, "elevation": 3, "azimuth": 16}
-EVERY_STEP = ("log_every_steps", "checkpoint_every_steps")
-
 
 def _config():
-    config = load_config(str(small.CONFIGS / "quickstart.py") + ":short")
-    return config.replace(
-        simulation={
-            "frames_per_sequence": 2,
-            "grid": {f"num_{axis}": count for axis, count in SIZES.items()},
-        },
-        model={
-            "doppler_bins": SIZES["doppler"],
-            "elevation_bins": SIZES["elevation"],
-            "widths": (8, 8),
-            "num_groups": 4,
-            "decoder_width": 8,
-            "neck": "plain",
-            "heads": "default",
-            "pad_multiple": 4,
-        },
-        train={"batch_size": 2, "num_epochs": 2} | dict.fromkeys(EVERY_STEP, 1),
+    every_step = {"log_every_steps": 1, "checkpoint_every_steps": 1}
+    return small.shrink_run(load_config("quickstart:short")).replace(
+        simulation={"frames_per_sequence": 2},
+        train={"batch_size": 2, "num_epochs": 2} | every_step,
     )
 
 
@@ -85,7 +69,7 @@ def test_training_resumes_with_identical_results(tmp_path, monkeypatch):
     )
     data = simulate_dataset(finer, tmp_path / "finer", progress=False)
     with pytest.raises(
-        UserError, match=r"16 x 64 .*expected 4 x 16 .*model was trained"
+        UserError, match=r"16 x 64 .*expected 4 x 24 .*model was trained"
     ):
         evaluate_run(whole, other={"roots": (str(data),)})
     assert not (data / "records").exists()

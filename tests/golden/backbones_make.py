@@ -11,7 +11,6 @@ stored: they follow from names and seeds as in `dinorade_make.py`.
 timm imports torchvision, of which it needs nothing here: an empty module is enough.
 """
 
-import importlib.util
 import json
 import pathlib
 import sys
@@ -19,7 +18,10 @@ import tempfile
 
 import numpy as np
 
+from radejax.config import load_module
+
 HERE = pathlib.Path(__file__).parent
+SEEDS = load_module(HERE / "dinorade_make.py")
 _DINOV3_SIZES = ((32, 64), (48, 32))
 _DINOV2_SIZES = ((56, 56), (70, 112), (42, 28))  # the pretraining size, larger, smaller
 _TIMM = {"embed_dim": 128, "depth": 2, "num_heads": 2}
@@ -54,19 +56,9 @@ SOURCES = {
 """Arguments of the tiny model of each source; for Hugging Face and timm, those of its config."""
 
 
-def _seeds():
-    """The module with the seeded weights and inputs."""
-    spec = importlib.util.spec_from_file_location("seeds", HERE / "dinorade_make.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 def tensors(listing: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
     """The seeded tensors of a file with these names and shapes."""
-    found = {
-        name: _seeds().seeded_tensor(name, tuple(s)) for name, s in listing.items()
-    }
+    found = {name: SEEDS.seeded_tensor(name, tuple(s)) for name, s in listing.items()}
     for name, value in found.items():
         if name == "rope_embed.periods":  # a function of the model's size
             found[name] = np.float32(100 ** (np.arange(value.size) / value.size))
@@ -77,7 +69,7 @@ def tensors(listing: dict[str, tuple[int, ...]]) -> dict[str, np.ndarray]:
 
 def image(height: int, width: int) -> np.ndarray:
     """A normalized image [1, 3, H, W]."""
-    return _seeds().normal_input(height * width, (1, 3, height, width))
+    return SEEDS.normal_input(height * width, (1, 3, height, width))
 
 
 def _load(model, values) -> None:

@@ -10,10 +10,12 @@ radejax in float32 on a CPU: 5e-6 on maps, 1e-5 of the largest value on gradient
 
 import pathlib
 import sys
-import zlib
 
 import numpy as np
 
+from radejax.config import load_module
+
+HERE = pathlib.Path(__file__).resolve().parent
 SEED = 1234
 
 SMALL = {
@@ -60,16 +62,7 @@ GRADIENTS = (
 )
 
 
-def seeded_tensor(name, shape):
-    """A weight that depends on its name and shape only; float32, torch's layout."""
-    rng = np.random.default_rng([SEED, zlib.crc32(name.encode())])
-    if len(shape) == 1 and name.endswith("bias"):
-        value = 0.05 * rng.standard_normal(shape)
-    elif len(shape) == 1:
-        value = 1.0 + 0.1 * rng.standard_normal(shape)
-    else:
-        value = rng.standard_normal(shape) * np.sqrt(2.0 / np.prod(shape[1:]))
-    return value.astype(np.float32)
+seeded_tensor = load_module(HERE / "dinorade_make.py").seeded_tensor
 
 
 def seeded_state(shapes):
@@ -93,8 +86,7 @@ def _channels_last(tensor):
 
 
 def main():
-    root = pathlib.Path(__file__).resolve().parents[2]
-    sys.path.insert(0, str(root / "benchmarks"))
+    sys.path.insert(0, str(HERE.parents[1] / "benchmarks"))
     import torch
     import torch_radenet
 
@@ -119,7 +111,7 @@ def main():
         for name in GRADIENTS:
             if variant == "model":
                 arrays[f"{variant}/grad/{name}"] = parameters[name].grad.numpy()
-    np.savez_compressed(pathlib.Path(__file__).with_suffix(".npz"), **arrays)
+    np.savez_compressed(HERE / "models_radenet.npz", **arrays)
 
 
 if __name__ == "__main__":

@@ -6,44 +6,29 @@ import numpy as np
 import pytest
 
 from radejax import models
-from radejax.config import Config
 from radejax.core import devices
-from radejax.data.options import DataOptions
 from radejax.data.records import preprocess
 from radejax.inference.detector import Detector
 from radejax.inference.predict import predict_dataset
 from radejax.inference.saved import SavedModel
-from radejax.models.options import RadeNetOptions
 from radejax.runs.data import Data
 from radejax.runs.evaluate import Evaluation
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
 
-from ..small_models import drawn
+from .. import small_models as small
 
 
 @pytest.fixture(scope="module")
 def setup(tmp_path_factory):
     """Five simulated frames, and a detector that was never trained."""
     folder = tmp_path_factory.mktemp("predict")
-    grid = {"num_doppler": 4, "num_range": 32, "num_elevation": 3, "num_azimuth": 28}
-    simulation = SimulationOptions(
-        train_sequences=0, test_sequences=1, frames_per_sequence=5
-    ).replace(grid=grid)
+    grid = {"num_doppler": 2, "num_range": 32, "num_elevation": 3, "num_azimuth": 28}
+    counts = {"train_sequences": 0, "test_sequences": 1, "frames_per_sequence": 5}
+    simulation = SimulationOptions(**counts).replace(grid=grid)
     root = simulate_dataset(simulation, folder / "data", progress=False)
-    config = Config(
-        model=RadeNetOptions(
-            doppler_bins=4,
-            elevation_bins=3,
-            widths=(8, 8),
-            decoder_width=8,
-            num_groups=4,
-            cbam="off",
-            neck="plain",
-            heads="default",
-        ),
-        data=DataOptions(roots=(str(root),), records=str(folder / "records")),
-    ).replace(
+    config = small.radar_config().replace(
+        data={"roots": (str(root),), "records": str(folder / "records")},
         evaluation={"score_threshold": 0.45, "batch_size": 3},
         logging={"num_visualizations": 1},
     )
@@ -51,7 +36,7 @@ def setup(tmp_path_factory):
     data = Data(config)
     preprocess(data.frames, folder / "records", num_workers=0, progress=False)
     records = data.records
-    variables = drawn(model, np.zeros((1, *records.grid.projection_shape)))
+    variables = small.drawn(model, np.zeros((1, *records.grid.projection_shape)))
     return SimpleNamespace(
         config=config,
         model=model,

@@ -3,8 +3,6 @@
 import dataclasses
 import json
 import random
-import subprocess
-import sys
 
 import grain
 import jax
@@ -196,13 +194,6 @@ def test_the_demo_has_a_small_model_of_simulated_data():
     assert loaded.grid.projection_shape == (64, 56, 25)
 
 
-def test_orbax_is_loaded_for_checkpoints_only():
-    code = f"import radejax, sys; radejax.Detector.from_workdir({str(MODEL)!r})"
-    code += "; sys.exit(str({'orbax', 'grain', 'matplotlib'} & set(sys.modules)))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.stderr.strip().endswith("set()")
-
-
 @pytest.mark.slow
 def test_an_exported_camera_model_is_without_dinov3(tmp_path):
     detector = small.detector("camera")
@@ -230,10 +221,7 @@ def test_bfloat16_computes_close_to_float32():
     a, b = (np.asarray(d(inputs).scores[0, 0]) for d in (full, half))
     assert a != b
     assert a == pytest.approx(b, abs=0.02)
-    leaf = jax.tree.leaves(half.variables)[0]
-    assert leaf.dtype == np.float32
-    with pytest.raises(UserError, match="dtype is 'float16'"):
-        small.detector(dtype="float16")
+    assert jax.tree.leaves(half.variables)[0].dtype == np.float32
 
 
 def test_a_flipped_bit_of_the_weights_is_found(tmp_path):

@@ -220,10 +220,7 @@ def test_degenerate_boxes_give_finite_values_and_gradients(transform, dtype):
     ("call", "message"),
     [
         (lambda a: G.gwd(a[..., :7], a), r"must be \[..., 8\], got \(2, 7\)"),
-        (
-            lambda a: G.gwd_loss(a, a, transform="log"),
-            "transform is 'log', expected one of",
-        ),
+        (lambda a: G.gwd_loss(a, a, transform="log"), "transform is 'log', expected"),
     ],
 )
 def test_bad_arguments_are_rejected(call, message):

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.config import load_module
 from radejax.models.deformable_attention import DeformableAttention, lifted_attention
 
 from .plain_attention import plain_attention
@@ -66,11 +65,10 @@ def test_samples_by_hand():
 
 
 @pytest.mark.parametrize("name", MODULES)
-def test_reference_module_and_gradients(case_of, name, golden):
+def test_reference_module_and_gradients(case_of, name, make):
     info, case = case_of(name)
     sizes = [tuple(s) for s in info["shapes_hw"]]
     counts = info["n_heads"], info["n_points"]
-    make = load_module(golden / "dinorade_make.py")
     params = {}
     for key, tensor in make.seeded_state_dict(info["tensors"]).items():
         layer, kind = key.split(".")

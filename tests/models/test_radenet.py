@@ -16,7 +16,7 @@ from ..small_models import drawn
 
 @pytest.fixture(scope="module")
 def small(radenet_golden):
-    return RadeNetOptions(**radenet_golden["SMALL"])
+    return RadeNetOptions(**radenet_golden.SMALL)
 
 
 @pytest.fixture(scope="module")

@@ -14,12 +14,9 @@ from radejax.config import Config
 from radejax.core import devices
 from radejax.core.structures import Batch
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.losses.detection import LossOptions
-from radejax.models.options import RadeNetOptions
 from radejax.runs.experiment import TrainingData, fit
-from radejax.training.options import TrainOptions
 
-from ..small_models import drawn
+from ..small_models import drawn, radar_config, small_grid
 
 NUM_FRAMES = 16
 
@@ -71,30 +68,19 @@ class Tiny:
 @pytest.fixture(scope="session")
 def tiny() -> Tiny:
     """One bright bin an object, so that a few steps learn something."""
-    grid = RadarGrid.reduced(
-        num_doppler=2, num_range=16, num_elevation=2, num_azimuth=14, max_range_m=30.0
-    )
-    config = Config(
-        model=RadeNetOptions(
-            doppler_bins=2,
-            elevation_bins=2,
-            widths=(8, 8),
-            decoder_width=8,
-            num_groups=4,
-            cbam="off",  # irrelevant for the loop, and compiles faster
-            neck="plain",
-            heads="default",
-            heatmap_prior=0.1,
-        ),
-        loss=LossOptions(heatmap_sigma_bins=1.0),
-        train=TrainOptions(
-            batch_size=4,
-            num_epochs=2,
-            learning_rate=3e-3,
-            log_every_steps=1,
-            checkpoint_every_steps=3,
-            max_skipped_steps=2,
-        ),
+    grid = small_grid()
+    config = radar_config().replace(
+        # Attention is irrelevant for the loop, and takes longer to compile.
+        model={"cbam": "off", "heatmap_prior": 0.1},
+        loss={"heatmap_sigma_bins": 1.0},
+        train={
+            "batch_size": 4,
+            "num_epochs": 2,
+            "learning_rate": 3e-3,
+            "log_every_steps": 1,
+            "checkpoint_every_steps": 3,
+            "max_skipped_steps": 2,
+        },
     )
     model = models.build(config.model)
     variables = drawn(model, np.zeros((1, *grid.projection_shape)))

@@ -98,10 +98,7 @@ def test_incomplete_or_corrupted_folders(folder, tmp_path):
     with pytest.raises(FileNotFoundError, match=r"config.json and model.safetensors"):
         dinov3_hf.load(tmp_path / "nowhere")
     for change, message in (
-        (
-            lambda: weights.write_bytes(weights.read_bytes()[:999]),
-            "not a safetensors f",
-        ),
+        (lambda: weights.write_bytes(weights.read_bytes()[:999]), "not a safetensors"),
         (lambda: weights.unlink(), "lacks model.safetensors"),
         (lambda: index.touch(), "has its weights in several files"),
         (lambda: index.unlink() or weights.touch(), "not a safetensors file"),
@@ -194,24 +191,12 @@ def test_features_of_the_original_code(sources, name, tmp_path):
     ("name", "change", "message"),
     [
         ("timm", {"architecture": "convnext_tiny"}, "architecture is 'convnext_tiny'"),
-        (
-            "dinov2",
-            {"model_type": "tips"},
-            "json: model_type is 'tips', expected a ViT",
-        ),
+        ("dinov2", {"model_type": "tips"}, "json: model_type is 'tips', expected a"),
         ("dinov2", {"layer_norm_eps": 1e-5}, "json: layer_norm_eps is 1e-05, expected"),
-        (
-            "dinov2",
-            {"num_attention_heads": "2"},
-            "num_heads is '2', expected an integer",
-        ),
+        ("dinov2", {"num_attention_heads": "2"}, "num_heads is '2', expected an"),
         ("dinov2", {"num_hidden_layers": 3}, "missing layer.2."),
         ("dinov2", {"patch_size": 16}, r"patch_embeddings.weight .*14, 14\), expected"),
-        (
-            "dinov2",
-            {"model_type": "dinov3_vit"},
-            "DINOv3 config lacks intermediate_size",
-        ),
+        ("dinov2", {"model_type": "dinov3_vit"}, "DINOv3 config lacks"),
         ("meta", {"rope_embed.periods": [1, 2]}, "periods are not powers of 100"),
         ("meta", {"blocks.0.attn.qkv.bias_mask": [1] * 96}, "unexpected .*k_proj.bias"),
         ("meta", {"blocks.0.ls1.gamma": [np.nan] * 32}, "layer_scale1.* not finite"),
@@ -220,12 +205,12 @@ def test_features_of_the_original_code(sources, name, tmp_path):
         (
             "timm_qkvb",
             {"blocks.0.attn.q_bias": None},
-            "1 problems: missing .*q_proj.bias",
+            "missing .*q_proj.bias",
         ),
         (
             "timm_qkvb",
             {"blocks.0.attn.v_bias": None},
-            "1 problems: missing .*v_proj.bias",
+            "missing .*v_proj.bias",
         ),
     ],
 )
