@@ -103,24 +103,6 @@ def test_boxes_before_nms_of_the_released_code(case):
         np.testing.assert_array_equal(peaks.bins[frame, :count], boxes[:, [11, 10]])
 
 
-def test_detections_of_the_released_code(case):
-    want, maps, grid = case
-    found = decode(maps, grid, max_detections=48, roi=roi_of(want))
-    for frame in range(3):
-        before = want[f"boxes_before_nms_{frame}"]
-        kept = before[want[f"kept_{frame}"]]
-        count = len(kept)
-        assert int(found.is_valid[frame].sum()) == count
-        np.testing.assert_allclose(
-            found.boxes[frame, :count, :6], kept[:, :6], atol=2e-5
-        )
-        yaw = np.arctan2(kept[:, 6], kept[:, 7])
-        np.testing.assert_allclose(found.boxes[frame, :count, 6], yaw, atol=2e-5)
-        np.testing.assert_allclose(found.scores[frame, :count], kept[:, 8], atol=1e-6)
-        np.testing.assert_array_equal(found.classes[frame, :count], kept[:, 9])
-    np.testing.assert_array_equal(found.num_truncated, 0)
-
-
 def test_ties_of_the_released_code(golden):
     want = np.load(golden / "detection_ties.npz")
     heatmap = np.zeros((1, 5, 256, 112), np.float32)
@@ -293,7 +275,7 @@ def test_length_of_the_yaw_vector_scales_boxes_in_nms_only_as_released():
     np.testing.assert_allclose(always.boxes[0, 0, 3:5], 6, rtol=1e-6)
 
 
-def test_official_preset_decodes_as_released(case):
+def test_detections_of_the_released_code(case):
     """Region filter before NMS and boxes as the released evaluator takes them."""
     want, maps, grid = case
     options = load_config("configs/radenet.py:official").decode
@@ -304,11 +286,17 @@ def test_official_preset_decodes_as_released(case):
     for frame in range(3):
         kept = want[f"boxes_before_nms_{frame}"][want[f"kept_{frame}"]]
         norm = np.hypot(kept[:, 6], kept[:, 7])[:, None]
-        boxes = found.boxes[frame, : len(kept)]
-        assert int(found.is_valid[frame].sum()) == len(kept)
+        count = len(kept)
+        assert int(found.is_valid[frame].sum()) == count
+        np.testing.assert_allclose(found.scores[frame, :count], kept[:, 8], atol=1e-6)
+        np.testing.assert_array_equal(found.classes[frame, :count], kept[:, 9])
+        boxes = found.boxes[frame, :count]
+        yaw = np.arctan2(kept[:, 6], kept[:, 7])
+        np.testing.assert_allclose(boxes[:, 6], yaw, atol=2e-5)
         np.testing.assert_allclose(boxes[:, :3], kept[:, :3], atol=2e-5)
         np.testing.assert_allclose(boxes[:, 3:5], kept[:, 3:5] * norm, atol=2e-5)
         np.testing.assert_allclose(boxes[:, 5], kept[:, 5], atol=2e-5)
+    np.testing.assert_array_equal(found.num_truncated, 0)
 
 
 def test_thresholds_and_region_are_traced_values():

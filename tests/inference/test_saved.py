@@ -61,24 +61,8 @@ def test_a_torch_file_is_loaded_like_a_folder(tmp_path):
     assert (loaded.step, loaded.run) == (None, {})
     assert loaded.grid.projection_shape == (256, 107, 101)
     assert len(loaded.config.classes) == options.num_classes
-    with pytest.raises(UserError, match=r"holds one model only, but step=3 is given"):
-        load_model(path, step=3)
-    with pytest.raises(UserError, match="the model is RADE-Net"):
-        load_model(path, image_backbone=tmp_path)
     weights, *_ = starting_weights(options, path)
     jax.tree.map(np.testing.assert_array_equal, weights, loaded.variables)
-
-
-def test_a_run_that_has_not_trained_says_so(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no such file or folder"):
-        Detector.from_workdir(tmp_path / "gone")
-    with pytest.raises(
-        FileNotFoundError, match=r"no model in .*: expected config\.json"
-    ):
-        load_model(tmp_path)
-    (tmp_path / "config.json").write_text(Config().model_dump_json())
-    with pytest.raises(FileNotFoundError, match="a run that has trained"):
-        Detector.from_workdir(tmp_path)
 
 
 def test_classes_reordered_in_a_workdir_change_nothing_or_are_rejected(tmp_path):
@@ -113,18 +97,7 @@ def test_weights_of_another_run_need_the_same_model(tmp_path):
     variables, pretrained, _ = starting_weights(model.config.model, init_from=tmp_path)
     assert pretrained is None
     jax.tree.map(np.testing.assert_array_equal, variables, dict(model.variables))
-    other = small.saved(model__heatmap_prior=0.25).config.model
-    with pytest.raises(
-        UserError, match=r"do not fit: config\.model\.heatmap_prior is .* 0\.25 here"
-    ):
-        starting_weights(other, init_from=tmp_path)
-
-
-def test_without_anything_to_start_from_all_is_initialized():
-    config = small.radar_config().model
-    assert starting_weights(config) == (None, None, None)
-    with pytest.raises(UserError, match="RadeNet has no camera"):
-        starting_weights(config, image_backbone_path="dinov3")
+    assert starting_weights(model.config.model) == (None, None, None)
 
 
 def test_a_frozen_backbone_is_known_by_its_weights(tmp_path):
@@ -241,6 +214,30 @@ def test_a_flipped_bit_of_the_weights_is_found(tmp_path):
     (tmp_path / "detector.stablehlo").write_bytes(b"e program")
     with pytest.raises(ValueError, match=r"detector\.stablehlo: corrupted"):
         exported_loader.load(tmp_path)
+
+
+def test_folders_and_files_that_do_not_fit_are_named(tmp_path):
+    config, torch_file = small.radar_config().model, tmp_path / "best.safetensors"
+    _write_torch(torch_file)
+    untrained, other = tmp_path / "run", tmp_path / "other"
+    for folder in (untrained, other):
+        folder.mkdir()
+    (untrained / "config.json").write_text(Config().model_dump_json())
+    save_model(small.saved(model__heatmap_prior=0.25), other)
+    for call, message in (
+        (lambda: Detector.from_workdir(tmp_path / "gone"), "no such file or folder"),
+        (lambda: load_model(tmp_path), r"no model in .*: expected config\.json"),
+        (lambda: Detector.from_workdir(untrained), "a run that has trained"),
+        (lambda: load_model(torch_file, step=3), "holds one model only, but step=3"),
+        (lambda: load_model(torch_file, image_backbone="x"), "the model is RADE-Net"),
+        (lambda: starting_weights(config, other), r"do not fit: .*\.heatmap_prior is"),
+        (
+            lambda: starting_weights(config, image_backbone_path="dinov3"),
+            "RadeNet has no camera",
+        ),
+    ):
+        with pytest.raises((UserError, FileNotFoundError), match=message):
+            call()
 
 
 def test_whatever_is_wrong_in_the_config_is_named(tmp_path):

@@ -270,28 +270,6 @@ def test_a_state_comes_back_bit_for_bit_on_another_number_of_devices(
     assert jax.tree.leaves(restored)[0].sharding.device_set == set(jax.devices()[:then])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("first", "then"), [(4, 1), (1, 4)])
-def test_a_run_continues_on_another_number_of_devices(
-    first: int,
-    then: int,
-    run: Any,
-    tiny: Tiny,
-    undisturbed: Any,
-    workdir: pathlib.Path,
-) -> None:
-    def stop() -> None:
-        raise RuntimeError("moved")
-
-    with pytest.raises(RuntimeError, match="moved"):
-        run(workdir, Stopping(tiny.loader(), 6, stop), num_devices=first)
-    assert run(workdir, num_devices=then)[1]
-    losses, expected = _losses(workdir), _losses(undisturbed[1])
-    np.testing.assert_allclose(
-        [v for _, v in losses], [v for _, v in expected], rtol=0.05
-    )
-
-
 def test_steps_without_finite_loss_end_the_run(
     run: Any, tiny: Tiny, workdir: pathlib.Path, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -59,22 +59,6 @@ def test_a_big_endian_file(tmp_path):
     np.testing.assert_array_equal(content["a"], [[0, 1, 2], [3, 4, 5]])
 
 
-def test_reads_torchs_own_checkpoints(tmp_path):
-    torch = pytest.importorskip("torch")
-    base = torch.arange(12.0).reshape(3, 4)
-    optimizer = torch.optim.AdamW([torch.nn.Parameter(base.clone())])
-    checkpoint = {
-        "model": {"view": base.T[1:], "bf16": base.to(torch.bfloat16)},
-        "optimizer": optimizer.state_dict(),
-    }
-    path = tmp_path / "x.pth"
-    torch.save(checkpoint, path)
-    content = torch_file.read(path)
-    np.testing.assert_array_equal(content["model"]["view"], base.T[1:])
-    np.testing.assert_array_equal(content["model"]["bf16"], base)
-    assert content["optimizer"]["param_groups"][0]["lr"] == 1e-3
-
-
 class Attack:
     """Would create a file when unpickled in the usual way."""
 
