@@ -21,6 +21,7 @@ LAYERS = (
     {"inference"},
     {"runs"},
     {"cli"},
+    {"__main__"},
 )
 """The table of docs/architecture.md, lowest first.
 
