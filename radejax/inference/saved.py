@@ -359,11 +359,11 @@ def starting_weights(
         )
     digest = None
     if isinstance(options, DinoRadeOptions) and options.image.freeze:
-        given = pretrained or variables
-        assert given is not None  # `load_image_backbone` requires frozen weights
-        digest = embeddings_sha256 or image_backbone.weights_sha256(
-            given["params"][IMAGE_BACKBONE]
-        )
+        digest = embeddings_sha256
+        if digest is None:
+            given = pretrained or variables
+            assert given is not None  # `load_image_backbone` requires frozen weights
+            digest = image_backbone.weights_sha256(given["params"][IMAGE_BACKBONE])
     return variables, pretrained, digest
 
 

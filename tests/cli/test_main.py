@@ -105,6 +105,27 @@ def test_a_folder_without_frames_says_what_was_looked_for(
     assert "tesseract_*.mat" in result.output
 
 
+def test_failed_frames_are_listed_with_exit_code_1(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    count = {"frames": 1, "boxes": 2, "clipped": 0}
+    failed = {f"5/{i:05d}": "x of the box is nan" for i in range(30)}
+    place = "radejax.inference.detect_files"
+    monkeypatch.setattr(f"{place}.find_inputs", lambda *args, **options: None)
+    monkeypatch.setattr(
+        f"{place}.detect_files", lambda *args, **options: (count, failed)
+    )
+    words = ("detect", tmp_path, "--workdir", MODEL, "--out", tmp_path / "out")
+    result = _run(*words)
+    assert result.exit_code == 1
+    first, *lines = result.stdout.splitlines()
+    assert first.endswith("30 frames failed")
+    assert lines == [f"failed {k}: {x}" for k, x in list(failed.items())[:20]]
+    result = _run(*words, "--json")
+    assert result.exit_code == 1
+    assert json.loads(result.stdout)["failed"] == failed
+
+
 def test_debug_shows_the_traceback(tmp_path: pathlib.Path) -> None:
     arguments = ("export", tmp_path, "--out", tmp_path / "out")
     plain = _run(*arguments)
