@@ -35,11 +35,9 @@ if TYPE_CHECKING:  # the names for editors and type checkers
     from radejax.runs.data import data_of_run as data_of_run
     from radejax.runs.experiment import run as run
     from radejax.runs.figures import frame_scene as frame_scene
-    from radejax.simulation.dataset import simulate_dataset
+    from radejax.simulation.dataset import simulate_dataset as simulate
     from radejax.visualize.draw import draw_frame as draw_frame
     from radejax.visualize.style import Scene as Scene
-
-    simulate = simulate_dataset
 
 # On first use: reading labels or evaluating files should not load the models.
 _MODULES = {
@@ -64,7 +62,8 @@ _MODULES = {
 }
 _LAZY = {name: module for module, names in _MODULES.items() for name in names}
 
-__all__ = list(_LAZY)
+# Type checkers export a function under another name only if `__all__` has a literal.
+__all__ = [*_LAZY, "simulate"]
 
 
 def __dir__() -> list[str]:
