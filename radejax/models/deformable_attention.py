@@ -147,16 +147,14 @@ class DeformableAttention(Layer):
         total = query_weights.sum(-1, keepdims=True)  # 0 for bins without a query
         return out + (total * jnp.expand_dims(bias, (0, 1))).astype(self.dtype)
 
-    def _ring(
-        self, _: jax.Array, shape: tuple[int, ...], dtype: DTypeLike = jnp.float32
-    ) -> jax.Array:
+    def _ring(self, _: jax.Array, shape: tuple[int, ...]) -> jax.Array:
         """Initializes the offsets: one direction per head, point i at i + 1 pixels."""
         angle = 2 * math.pi * np.arange(self.num_heads) / self.num_heads
         way = np.stack([np.cos(angle), np.sin(angle)], -1)
         way = way / np.abs(way).max(-1, keepdims=True)
         distance = np.arange(1, self.num_points + 1)
         grid = way[:, None] * distance[:, None]  # [heads, P, 2]
-        return jnp.asarray(grid.reshape(shape), dtype)
+        return jnp.asarray(grid.reshape(shape), jnp.float32)
 
 
 # Sampling of all queries of a bin ---------------------------------------------------

@@ -34,14 +34,12 @@ def uniform_fan_in(fan_in: int) -> Initializer:
     """
     bound = 1.0 / math.sqrt(fan_in)
 
-    def init(
-        key: jax.Array, shape: tuple[int, ...], dtype: DTypeLike = jnp.float32
-    ) -> jax.Array:
+    def init(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
         # The first numbers do not depend on how many are drawn. Rounding the count up
         # therefore changes no weight, but lets many shapes share a compiled generator.
         size = math.prod(shape)
         count = max(2**14, 4 ** math.ceil(math.log(size, 4)))
-        numbers = jax.random.uniform(key, (count,), dtype, -bound, bound)
+        numbers = jax.random.uniform(key, (count,), jnp.float32, -bound, bound)
         weights: jax.Array = _cut(numbers, shape)
         return weights
 
