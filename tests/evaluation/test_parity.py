@@ -102,7 +102,7 @@ def test_radenets_own_code_on_a_scene(golden):
 def test_a_slow_implementation_on_three_scenes(golden):
     """Loops over frames, boxes and thresholds, with shapely, wrote the golden file.
 
-    They were tests/evaluation/reference.py up to version 0.3.
+    They are tests/evaluation/reference.py and tests/golden/evaluation_scenes.py of commit fcc0c24.
     """
     data = np.load(golden / "evaluation_scenes.npz")
     ious, cuts = data["ious"].tolist(), data["cuts"].tolist()

@@ -4,8 +4,8 @@
     NUMBA_ENABLE_CUDASIM=1 python tests/golden/kradar_make.py K-Radar
 
 The scene is `kradar_scene` of tests/evaluation/scenes.py: boxes from a seed, no K-Radar data. The
-code is that of commit 97fe0a6, unchanged, with numba 0.61.2 and NumPy 1.26.4, and its kernel for
-the overlaps runs in numba's CUDA simulator. Needs radejax, numba, fire and scikit-image.
+code is that of commit 97fe0a6, unchanged, with numba 0.68.1 and NumPy 2.4.6, and its kernel for
+the overlaps runs in numba's CUDA simulator. Needs radejax, numba and scikit-image.
 
     ap: [variant, score cut, condition, space, IoU, class], percent.
     scores, precision: [variant, space, IoU, class, 41] of all frames without a cut.

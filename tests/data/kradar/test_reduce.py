@@ -1,7 +1,6 @@
 """Datasets of reduced releases: written, recognized, spread over disks, mixed."""
 
 import shutil
-import zipfile
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from radejax.data.kradar.folders import is_elevation_axis_up
 from radejax.data.kradar.reduce import reduce_dataset
 from radejax.data.kradar.reduced import project_reduced, reduce_tensor, strongest_points
 from radejax.data.kradar.tesseract import read_tesseract
-from radejax.data.records import Records, open_projections, preprocess
+from radejax.data.records import Records, preprocess
 
 
 def reduced_root(source, out, release):
@@ -87,50 +86,25 @@ def test_points_of_another_rate_are_not_mixed(kradar_root, tmp_path):
     assert reduce_dataset([kradar_root], out, "rpc", 0.2).num_written == 1
 
 
-def test_two_disks_a_label_zip_and_a_partial_copy(kradar_root, tmp_path):
-    """Radar data as the archives have them: sequence folders with frames only."""
+def test_bad_and_missing_frames_are_found_and_skipped(kradar_root, tmp_path):
     root = reduced_root(kradar_root, tmp_path / "out", "polar3d")
-    radar, others = tmp_path / "radar", tmp_path / "others"
-    for path in root.glob("*/polar3d_*.npy"):
-        target = radar / path.relative_to(root)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        path.rename(target)
-    (radar / "2/polar3d_00005.npy").unlink()
-    with zipfile.ZipFile(tmp_path / "labels.zip", "w") as archive:
-        for path in root.glob("*/info_label/*.txt"):
-            archive.write(path, f"{path.parts[-3]}/{path.name}")
-            path.unlink()
-        archive.writestr("7/00001_00001.txt", "a sequence that was not downloaded")
-    shutil.copytree(root, others)
-    data = KRadar([radar, others], tmp_path / "labels.zip", split="train")
-    assert data.release == "polar3d"
-    assert len(data) == 8
-    assert data[0].radar_path.parent == radar / "1"
-    report = check_dataset([radar, others], labels=tmp_path / "labels.zip")
-    (problem,) = report.summary.problems
-    assert problem[1].startswith("2/00005_00002: no polar3d_00005.npy in ")
-    assert [row["projections"] for row in report.sequences] == [6, 5]
-    records = tmp_path / "records"
-    whole = KRadar([radar, others], tmp_path / "labels.zip")
-    for shard in range(3):
-        done = preprocess(whole, records, shard=(shard, 3), progress=False)
-        assert len(done.skipped) == (shard == 1)
-    assert len(open_projections(records, whole.grid).keys()) == 11
-    assert Records.open(records).source["release"] == "polar3d"
-    with pytest.raises(UserError, match="release"):
-        preprocess(KRadar(kradar_root), records, progress=False)
-
-
-def test_corrupted_frames_are_found_and_skipped(kradar_root, tmp_path):
-    root = reduced_root(kradar_root, tmp_path / "out", "polar3d")
+    (root / "2/polar3d_00005.npy").unlink()
     path = root / "1/polar3d_00006.npy"
     np.save(path, np.load(path)[[0, 1]] * [[[[1e13]]], [[[1]]]])
     path.with_name("polar3d_00007.npy").write_bytes(b"\x93NUMPY")
     shallow, deep = (check_dataset(root, deep=deep) for deep in (False, True))
-    assert shallow.summary.problem_counts() == {"projection corrupted": 1}
-    assert deep.summary.problem_counts() == {"projection corrupted": 2}
-    report = preprocess(KRadar(root), tmp_path / "records", progress=False)
-    assert sorted(report.skipped) == ["1/00006_00003", "1/00007_00004"]
+    for report, count in ((shallow, 1), (deep, 2)):
+        counts = {"tesseract missing": 1, "projection corrupted": count}
+        assert report.summary.problem_counts() == counts
+        assert "2/00005_00002: no polar3d_00005.npy in " in report.to_text()
+        assert [row["projections"] for row in report.sequences] == [6, 5]
+    records = tmp_path / "records"
+    report = preprocess(KRadar(root), records, num_workers=0, progress=False)
+    missing = "2/00005_00002"
+    assert sorted(report.skipped) == ["1/00006_00003", "1/00007_00004", missing]
+    assert Records.open(records).source["release"] == "polar3d"
+    with pytest.raises(UserError, match="release"):
+        preprocess(KRadar(kradar_root), records, progress=False)
     assert "divided by 1e+13" in report.skipped["1/00006_00003"]
 
 
