@@ -36,8 +36,8 @@ def random_qkv(tokens, dtype=np.float32, heads=3, head_dim=8):
     return [rng.standard_normal(shape).astype(dtype) * 2 for _ in range(3)]
 
 
-@pytest.mark.parametrize("kind", ["auto", "blocked", "xla"])
-@pytest.mark.parametrize("tokens", [1, 17, 700])  # below and above one block
+@pytest.mark.parametrize("kind", ["blocked", "xla"])
+@pytest.mark.parametrize("tokens", [17, 700])  # below and above one block
 def test_attention_follows_the_formula(kind, tokens):
     query, key, value = random_qkv(tokens)
     actual = jax.jit(vit.attend, static_argnums=3)(query, key, value, kind)
