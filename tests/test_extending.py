@@ -154,7 +154,8 @@ def test_records_of_other_files_or_of_another_reader_are_reported(
     assert f"4 records in {tmp_path / 'records'} are used" in text
     assert "changed" not in text
     (root / "1" / "0002.npz").touch()
-    assert "radar files of 1 of them, such as that of frame 1/0002, have" in again()
+    assert "1 of 4 files were made from other files than there are now" in again()
+    assert "such as 1/0002: delete these" in caplog.text
     read = toy.ToyFrame.read_projection
     mirrored = lambda frame, grid: read(frame, grid)[:, ::-1]  # noqa: E731
     with monkeypatch.context() as patch:
@@ -163,7 +164,7 @@ def test_records_of_other_files_or_of_another_reader_are_reported(
             again()
     monkeypatch.setattr(reader, "reader_version", "2")
     with pytest.raises(
-        UserError, match=r"other records: source.reader is \['toy:Toy', ''"
+        UserError, match=r"other records: options.source.reader is \['toy:Toy', ''"
     ):
         again()
 

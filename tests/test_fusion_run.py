@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import json
 import logging
+import os
 import pathlib
 import re
 import shutil
@@ -115,10 +116,19 @@ def embed(data, config, out, *options):
 @pytest.fixture(scope="module")
 def embeddings(data, from_images, tmp_path_factory):
     out = tmp_path_factory.mktemp("embeddings")
-    for counts in ("12 frames, 12 embedded, 0 found", "12 frames, 0 embedded, 12"):
+    path = min(data.folder.glob("1/cam-front/*.png"))
+    content, state = path.read_bytes(), path.stat()
+    path.write_bytes(b"")
+    result = embed(data, small_config(), out)
+    assert "12 frames: 0 were done, 11 preprocessed, 1 skipped" in result.output
+    assert result.exit_code == 1
+    assert f"{path}: corrupted" in result.output
+    path.write_bytes(content)
+    os.utime(path, ns=(state.st_atime_ns, state.st_mtime_ns))
+    for counts in ("11 were done, 1 preprocessed", "12 were done, 0 preprocessed"):
         assert counts in embed(data, small_config(), out).output
     wrong = small_config().with_fields({"model.image.size": (16, 48)})
-    assert "other records: shape is" in embed(data, wrong, out).output
+    assert "other records: options.shape is" in embed(data, wrong, out).output
     found = open_embeddings(out)
     assert (found.shape, np.dtype(found.dtype)) == ((2, 6, 96), np.float32)
     return out
@@ -273,13 +283,13 @@ def test_embeddings_that_do_not_fit_are_rejected(data, embeddings, tmp_path):
         return Data(changed)
 
     plain = config.with_fields({"model.image.standardize": False}).model.image
-    (tmp_path / "records.json").write_text('{"shape": [2, 3]}')
+    (tmp_path / "manifest.json").write_text('{"options": {"shape": [2, 3]}}')
     for call, message in (
         (lambda: open_embeddings(embeddings, plain.to_dict()), "standardize is True"),
         (lambda: open_data({"data.mirror_probability": 0.5}), "cannot be mirrored"),
         (lambda: open_data({"model.image.freeze": False}), "freeze=True"),
         (lambda: open_embeddings(tmp_path / "nothing"), "radejax embed"),
-        (lambda: open_embeddings(tmp_path), r"records\.json: corrupted"),
+        (lambda: open_embeddings(tmp_path), r"manifest\.json: corrupted"),
     ):
         with pytest.raises((UserError, DataError, FileNotFoundError), match=message):
             call()

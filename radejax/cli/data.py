@@ -246,13 +246,14 @@ def points(
     """Write radar points of radar tensors, projections, polar3d or rpc files.
 
     PATHS are files and folders. OUT/SEQUENCE/rpc_FRAME has the columns of K-Radar's rpc
-    files. Existing files are replaced. Files that are corrupted are skipped and listed,
-    with exit code 1.
+    files. Existing files are replaced; points of other options are an error. Files that
+    are corrupted are skipped and listed, with exit code 1.
 
     Example: radejax points /disk1/kradar --to pcd --method cfar --out clouds
     """
     import tqdm
 
+    from radejax.core.manifest import Manifest
     from radejax.data.kradar.folders import is_elevation_axis_up, read_grid
     from radejax.data.kradar.points import read_points, write_points
     from radejax.data.kradar.radar_files import find_frames, sequence_folder
@@ -274,6 +275,7 @@ def points(
     roots = sorted({*map(pathlib.Path, paths), *folders})
     grid = read_grid(roots)
     is_axis_up = is_elevation_axis_up(roots)
+    Manifest.claim(out, "points", options, patterns=["rpc_*"])
     began = time.perf_counter()
     for target, path in tqdm.tqdm(sources.items(), "points", unit="frame"):
         try:
@@ -320,6 +322,7 @@ def embed(
     """Precompute frozen-backbone features of the front camera images.
 
     Run again, it embeds only images without an embedding, such as those of another disk.
+    Corrupted images are skipped and listed, with exit code 1.
     `radejax train --embeddings OUT` then needs no images.
     Without ROOTS, the dataset that the config simulates is used, and made if missing.
 
@@ -342,7 +345,7 @@ def embed(
         settings = located(settings)
         simulate_missing(settings)
         roots = settings.data.roots
-    counts = embed_dataset(
+    report = embed_dataset(
         model,
         variables,
         radejax.KRadar(roots, version=settings.data.label_version, **part),
@@ -351,4 +354,4 @@ def embed(
         resize=settings.data.used_camera.resize,
         batch_size=batch_size,
     )
-    click.echo(", ".join(f"{number:,} {name}" for name, number in counts.items()))
+    _echo_report(report)

@@ -4,30 +4,37 @@ A job that writes one file per frame describes itself in its folder:
 
 manifest.json          what the folder contains, the options and the names of all files that
                        the finished job has
-manifest.<id>.jsonl    one line per written file: its name, and name, size and modification
-                       time of each file that it was made from
+manifest.<id>.jsonl    one line per written file: the time, its name (of records, the key
+                       of the frame), and name, size and modification time of each file
+                       that it was made from
 
-Every call of a job appends to a file of its own, so that several processes and hosts can
-work in one folder. A line that a killed process left incomplete is ignored.
+Every process appends to a file of its own, so that several processes and hosts can work in
+one folder. A line that a killed process left incomplete is ignored.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import json
+import logging
 import os
 import pathlib
+import time
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from typing import IO
 
 import radejax
 from radejax.core import files
-from radejax.core.errors import DataError
+from radejax.core.errors import DataError, UserError
 from radejax.core.files import JsonObject, PathLike
 
+_log = logging.getLogger(__name__)
+
 FILE = "manifest.json"
+
+_PROCESS = uuid.uuid4().hex[:12]
 
 State = list[list[str | int]]
 """Name, size and modification time in nanoseconds of every file."""
@@ -44,6 +51,47 @@ def state_of(paths: Iterable[PathLike | None]) -> State:
     return found
 
 
+def add(folder: pathlib.Path, name: str, sources: State) -> None:
+    """Logs a file that is to be written into a folder next, and the state of its sources."""
+    path = folder / f"manifest.{_PROCESS}{os.getpid()}.jsonl"
+    with files.disk_full(path), open(path, "a") as file:
+        file.write(json.dumps([time.time_ns(), name, sources]) + "\n")
+
+
+def read_sources(folder: pathlib.Path) -> dict[str, State]:
+    """Returns the state of the sources of every logged file, by its name."""
+    lines = []
+    for path in folder.glob("manifest.*.jsonl"):
+        for line in files.read_text(path).splitlines():
+            with contextlib.suppress(ValueError):  # the process was killed
+                time_ns, name, state = json.loads(line)
+                lines.append((time_ns, name, state))
+    return {name: state for _, name, state in sorted(lines)}
+
+
+def warn_of_changes(
+    folder: pathlib.Path, sources: Mapping[str, PathLike | None]
+) -> list[str]:
+    """Returns the files that were made from something else, and logs their number.
+
+    Args:
+        folder: Folder of the files.
+        sources: The file from which each file would be made now, by name. Files whose
+            source is missing now, or was not logged, count as unchanged.
+    """
+    known = read_sources(folder)
+    states = {name: state_of([path]) for name, path in sources.items() if name in known}
+    changed = [name for name, now in states.items() if now and now != known[name]]
+    if changed:
+        text = (
+            "%s: %d of %d files were made from other files than there are now (name, size or "
+            "time differ), such as %s: delete these, or the folder, and repeat the command"
+        )
+        place = files.relative(folder)
+        _log.warning(text, place, len(changed), len(sources), changed[0])
+    return changed
+
+
 @dataclasses.dataclass(frozen=True)
 class Manifest:
     """The description of an output folder.
@@ -53,13 +101,16 @@ class Manifest:
         options: What the files depend on besides their sources, as JSON values.
         names: Names of all files of the finished job, relative to the folder; empty if the
             folder grows with the dataset.
-        sources: State of the sources of every written file, by its name.
     """
 
     folder: pathlib.Path
     options: JsonObject
     names: tuple[str, ...]
-    sources: Mapping[str, State]
+
+    @functools.cached_property
+    def sources(self) -> Mapping[str, State]:
+        """State of the sources of every written file, by its name."""
+        return read_sources(self.folder)
 
     @classmethod
     def open(cls, folder: PathLike) -> Manifest | None:
@@ -72,13 +123,7 @@ class Manifest:
         if not (folder / FILE).is_file():
             return None
         content = files.read_object(folder / FILE, "options", "names")
-        sources = {}
-        for path in sorted(folder.glob("manifest.*.jsonl")):
-            for line in files.read_text(path).splitlines():
-                with contextlib.suppress(ValueError):  # the process was killed
-                    name, state = json.loads(line)
-                    sources[name] = state
-        return cls(folder, content["options"], tuple(content["names"]), sources)
+        return cls(folder, content["options"], tuple(content["names"]))
 
     @classmethod
     def claim(
@@ -87,18 +132,22 @@ class Manifest:
         what: str,
         options: JsonObject,
         names: Sequence[str] = (),
+        patterns: Sequence[str] = (),
     ) -> Manifest:
         """Describes a new folder, or opens that of an earlier call of the same job.
+
+        With patterns, a folder in which nothing was written yet may get other options.
 
         Args:
             folder: Folder of the job, created if missing.
             what: Content of the folder, such as "boxes", for the error message.
             options: See `Manifest`.
             names: See `Manifest`.
+            patterns: Patterns of the names of the job's files, such as "*.npy".
 
         Raises:
             UserError: The folder belongs to another job; the message names the options that
-                differ.
+                differ. Or it has files of the patterns and no description.
             DataError: The description is corrupted.
         """
         folder = files.as_path(folder)
@@ -108,27 +157,27 @@ class Manifest:
             "options": options,
             "names": list(names),
         }
-        ignore = ("radejax",)
-        files.claim(folder / FILE, wanted, f"other {what}", ignore=ignore)
-        found = cls.open(folder)
-        assert found is not None
-        return found
+        is_there = patterns and folder.is_dir()
+        written = files.find_files(folder, *patterns) if is_there else []
+        if written and not (folder / FILE).exists():
+            raise UserError(
+                f"{files.relative(written[0])} is there, but no {FILE} that describes how "
+                "it was made: choose another folder, or delete that one"
+            )
+        try:
+            ignore = ("radejax",)
+            files.claim(folder / FILE, wanted, f"other {what}", ignore=ignore)
+        except UserError:
+            same = files.read_object(folder / FILE).get("what") == what
+            if written or not patterns or not same:
+                raise
+            files.write_json(folder / FILE, wanted)
+        return cls(folder, options, tuple(names))
 
     @contextlib.contextmanager
     def log(self) -> Iterator[Callable[[str, State], None]]:
         """Yields a function `add(name, sources)` to call for every file that is written."""
-        path = self.folder / f"manifest.{uuid.uuid4().hex[:12]}.jsonl"
-        with contextlib.ExitStack() as stack:
-            file: IO[str] | None = None
-
-            def add(name: str, sources: State) -> None:
-                nonlocal file
-                if file is None:
-                    file = stack.enter_context(open(path, "w"))
-                file.write(json.dumps([name, sources]) + "\n")
-                file.flush()
-
-            yield add
+        yield functools.partial(add, self.folder)
 
     def is_done(self, name: str) -> bool:
         """Returns whether a file was written and is there."""

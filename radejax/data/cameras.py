@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Real, UInt8
 
+from radejax.core import manifest
 from radejax.core.archives import wrap_read_errors
 from radejax.core.errors import DataError, UserError
 from radejax.data.dataset import FrameSequence, LabelledFrame
@@ -201,6 +202,8 @@ def camera_inputs(
     if features is not None:
         keys = features.keys()
         sources = [frame.key if frame.key in keys else None for frame in frames]
+        paths = {frame.key: frame.camera_path for frame in frames}
+        manifest.warn_of_changes(features.folder, paths)
         with_image = [frame.key for frame in frames if frame.camera_path is not None]
         if absent := [key for key in with_image if key not in keys]:
             raise UserError(

@@ -170,8 +170,8 @@ class LabelledFrames(Sequence[_F]):
         release: Reduced release from which the projections are computed (one of
             `radejax.data.kradar.reduced.RELEASES`), or None.
         reader_version: Text that a reader changes when it computes other projections from
-            the same files; records of another version are not used. None if neither the
-            reader nor the files change, which are then not compared with their records.
+            the same files; records of another version are not used. None if the reader
+            never changes.
         has_label_versions: Whether `config.data.label_version` applies to the format.
     """
 

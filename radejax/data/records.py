@@ -1,9 +1,11 @@
-"""Records: one array per frame in `FOLDER/<key>.npy`, described by `records.json`.
+"""Records: one array per frame in `FOLDER/<key>.npy`, described by a manifest.
 
 Projections of radar tensors (`preprocess`) and embeddings of front images
 (`radejax embed`) are stored as records. A file is written under a temporary name and
-renamed, so that the record of a frame is complete if its file exists. Records contain no
-labels. For another label revision, only frames without a record are preprocessed.
+renamed, so that the record of a frame is complete if its file exists. The manifest
+(`core.manifest`) has the options and the state of the file that each record was made from.
+Records contain no labels. For another label revision, only frames without a record are
+preprocessed.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ import numpy as np
 from jaxtyping import Real
 from tqdm import tqdm
 
-from radejax.core import files
+from radejax.core import files, manifest
 from radejax.core.archives import wrap_read_errors
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.workers import default_workers, process_pool
@@ -34,7 +36,6 @@ from radejax.geometry.radar_grid import RadarGrid, is_uniform
 
 _log = logging.getLogger(__name__)
 
-_DESCRIPTION = "records.json"
 _MAX_LISTED = 20
 _SMALL_JOB_BINS = 3e9  # about 50 of K-Radar's tensors, a few seconds
 
@@ -63,15 +64,15 @@ class Records:
 
         Raises:
             FileNotFoundError: There is no such folder.
-            DataError: `records.json` is corrupted.
+            DataError: The manifest is corrupted.
         """
-        path = files.as_path(folder) / _DESCRIPTION
+        path = files.as_path(folder) / manifest.FILE
         if not path.is_file():
             raise FileNotFoundError(
-                f"{folder}: no {_DESCRIPTION}; expected a folder that `radejax "
+                f"{folder}: no {manifest.FILE}; expected a folder that `radejax "
                 "preprocess` or `radejax embed` wrote"
             )
-        content = files.read_json(path)
+        content = files.read_object(path, "options")["options"]
         what = "a description of records: delete the folder and write it again"
         with wrap_read_errors(path, what):
             dtype = content["dtype"]
@@ -102,20 +103,14 @@ class Records:
 
         Raises:
             UserError: The dtype is unknown, or the folder has records of another kind;
-                the message lists the differences.
+                the message lists the differences. Or it has arrays without a manifest.
         """
-        path = files.as_path(folder) / _DESCRIPTION
+        path = files.as_path(folder) / manifest.FILE
         if dtype is None:
             dtype = cls.open(folder).dtype if path.is_file() else default_dtype
         require(dtype in ENCODINGS, "dtype", dtype, f"one of {', '.join(ENCODINGS)}")
-        wanted = {"shape": list(shape), "dtype": dtype, "source": source}
-        try:
-            files.claim(path, wanted, "other records")
-        except UserError:
-            if files.find_files(path.parent, "*.npy"):
-                raise
-            # They are of a call that failed before its first record.
-            files.write_json(path, wanted)
+        options = {"shape": list(shape), "dtype": dtype, "source": source}
+        manifest.Manifest.claim(folder, "records", options, patterns=["*.npy"])
         return cls.open(folder)
 
     @functools.cached_property
@@ -123,9 +118,9 @@ class Records:
         """The sensor axes of projections.
 
         Raises:
-            DataError: The records are not projections, or `records.json` is corrupted.
+            DataError: The records are not projections, or the manifest is corrupted.
         """
-        path = self.folder / _DESCRIPTION
+        path = self.folder / manifest.FILE
         if "grid" not in self.source:
             raise DataError(f"{path}: not the records of a radar")
         with wrap_read_errors(path, "the records of a radar"):
@@ -162,8 +157,21 @@ class Records:
                 raise ValueError(f"{array.dtype} array of shape {array.shape}")
             return array
 
-    def write(self, key: str, array: Real[np.ndarray, "..."]) -> None:
-        """Writes the record of a frame atomically."""
+    def write(
+        self,
+        key: str,
+        array: Real[np.ndarray, "..."],
+        sources: manifest.State | None = None,
+    ) -> None:
+        """Writes the record of a frame atomically.
+
+        Args:
+            key: Key of the frame.
+            array: Content of the record.
+            sources: State of the file that it was made from, when it was read.
+        """
+        if sources:
+            manifest.add(self.folder, key, sources)
         with files.atomic_write(self.path(key)) as file:
             np.save(file, array, allow_pickle=False)
 
@@ -187,7 +195,7 @@ def open_projections(folder: files.PathLike, grid: RadarGrid | None = None) -> R
 
     Raises:
         FileNotFoundError: There is no such folder.
-        DataError: `records.json` is corrupted or, if a grid is required, describes other
+        DataError: The manifest is corrupted or, if a grid is required, describes other
             records.
         UserError: The projections have another grid.
     """
@@ -211,14 +219,14 @@ def open_embeddings(
 
     Raises:
         FileNotFoundError: There is no such folder.
-        DataError: `records.json` is corrupted, or describes other records.
+        DataError: The manifest is corrupted, or describes other records.
         UserError: Another backbone made the embeddings.
     """
     records = Records.open(folder)
     image = records.source.get("image")
     is_whole = "weights_sha256" in records.source and len(records.shape) == 3
     if not isinstance(image, dict) or not is_whole:
-        raise DataError(f"{records.folder / _DESCRIPTION}: not embeddings of images")
+        raise DataError(f"{records.folder / manifest.FILE}: not embeddings of images")
     wanted = embedding_fields(image_config or image)
     if lines := files.differences(image, wanted, "config.model.image"):
         raise UserError(
@@ -300,7 +308,8 @@ def preprocess(
     """Writes the projection of every frame that has no record yet.
 
     Frames whose radar tensor is missing or corrupted are skipped and reported; the next
-    call tries them again. Several processes may work on different shards of a folder.
+    call tries them again. Existing records whose radar file has changed since are counted
+    in a warning. Several processes may work on different shards of a folder.
 
     Args:
         frames: Labelled frames, normally a `KRadar` without a split, as the records can
@@ -317,7 +326,7 @@ def preprocess(
     Raises:
         UserError: There are no frames, the shard or the dtype is invalid, the folder has
             records of another kind, or a worker process was killed.
-        DataError: `records.json` is corrupted.
+        DataError: The manifest is corrupted.
     """
     began = time.perf_counter()
     if not len(frames):
@@ -334,8 +343,7 @@ def preprocess(
     records = Records.create(folder, grid.projection_shape, dtype, source)
     keys = records.keys()
     mine = list(frames)[index::count]
-    if frames.reader_version is not None:
-        _warn_of_changes(records, [frame for frame in mine if frame.key in keys])
+    _check(records, [frame for frame in mine if frame.key in keys])
     missing = [frame for frame in mine if frame.key not in keys]
     if num_workers is None:
         is_small = len(missing) * math.prod(grid.shape_drea) < _SMALL_JOB_BINS
@@ -348,36 +356,18 @@ def preprocess(
     return PreprocessReport(len(mine), num_found, skipped, time.perf_counter() - began)
 
 
-def _file_of(frame: LabelledFrame) -> list[str | int] | None:
-    """Returns name, size and modification time of a frame's radar file, if it exists."""
-    if frame.radar_path is None or not frame.radar_path.exists():
-        return None
-    found = frame.radar_path.stat()
-    return [frame.radar_path.name, found.st_size, found.st_mtime_ns]
-
-
-def _warn_of_changes(records: Records, frames: FrameSequence) -> None:
-    """Logs which records are used and which of their radar files have changed since.
+def _check(records: Records, frames: FrameSequence) -> None:
+    """Logs how many records are used and how many of their radar files have changed.
 
     Raises:
-        UserError: The reader computes another projection for a file that has not changed.
+        UserError: A reader that has versions computes another projection for a file that
+            has not changed.
     """
-
-    def is_changed(frame: LabelledFrame) -> bool:
-        file = _file_of(frame)
-        stored = records.path(frame.key).with_suffix(".json")
-        return file is not None and files.read_json(stored) != file
-
-    changed = [frame.key for frame in frames if is_changed(frame)]
     _log.info("%d records in %s are used", len(frames), records.folder)
-    if changed:
-        _log.warning(
-            "the radar files of %d of them, such as that of frame %s, have changed: delete "
-            "the folder to preprocess them again",
-            len(changed),
-            changed[0],
-        )
-    for frame in itertools.islice((f for f in frames if f.key not in changed), 1):
+    sources = {frame.key: frame.radar_path for frame in frames}
+    changed = set(manifest.warn_of_changes(records.folder, sources))
+    same = [frame for frame in frames if frame.key not in changed]
+    for frame in same[: "reader" in records.source]:
         now = encode(frame.read_projection(records.grid), records.dtype)
         if not np.allclose(decode(now), decode(records[frame.key]), atol=0.01):
             raise UserError(
@@ -407,13 +397,12 @@ def _write_all(
 
 def _write(records: Records, frame: LabelledFrame) -> tuple[str, str]:
     """Writes the record of one frame; returns its key and the reason if it was skipped."""
+    state = manifest.state_of([frame.radar_path])
     try:
         projection = frame.read_projection(records.grid)
     except (DataError, OSError) as error:
         return frame.key, str(error)
     if projection.shape != records.shape:
         return frame.key, f"projection of shape {projection.shape}, not {records.shape}"
-    if "reader" in records.source:
-        files.write_json(records.path(frame.key).with_suffix(".json"), _file_of(frame))
-    records.write(frame.key, encode(projection, records.dtype))
+    records.write(frame.key, encode(projection, records.dtype), state)
     return frame.key, ""

@@ -5,6 +5,8 @@ They are records, but `data` cannot compute them, as it uses neither models nor 
 
 from __future__ import annotations
 
+import logging
+import time
 from collections.abc import Sequence
 
 import grain
@@ -14,13 +16,16 @@ import tqdm
 from flax.typing import VariableDict
 from jaxtyping import UInt8
 
-from radejax.core.errors import UserError
+from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike
+from radejax.core.manifest import state_of, warn_of_changes
 from radejax.data.cameras import read_left_image
 from radejax.data.dataset import LabelledFrame
-from radejax.data.records import Records, embedding_fields
+from radejax.data.records import PreprocessReport, Records, embedding_fields
 from radejax.models.dinorade import IMAGE_BACKBONE, DinoRade
 from radejax.weights.image_backbone import weights_sha256
+
+_log = logging.getLogger(__name__)
 
 
 def embed_dataset(
@@ -32,8 +37,11 @@ def embed_dataset(
     dtype: str | None = None,
     resize: bool = False,
     batch_size: int = 8,
-) -> dict[str, int]:
+) -> PreprocessReport:
     """Write the backbone's features of every front image that has none in the folder yet.
+
+    Corrupted images are skipped and reported; the next call tries them again. Frames
+    without an image, and embeddings whose image has changed since, are counted in warnings.
 
     Args:
         model: A `DinoRade` model.
@@ -47,32 +55,42 @@ def embed_dataset(
         batch_size: Number of images per batch.
 
     Returns:
-        The number of all "frames", of newly "embedded" images, of "found" embeddings that
-        existed before, and of "missing" images.
+        The report on the frames with an image or an embedding. Images are skipped if they
+        are corrupted or, without `resize`, of another size.
 
     Raises:
-        UserError: The folder contains other records, there are no frames, or the dtype is
+        UserError: The folder contains other records, there are no images, or the dtype is
             unknown.
-        DataError: An image is corrupted or, without `resize`, of another size.
     """
-    if not len(frames):
-        raise UserError("no frames to embed")
+    began = time.perf_counter()
+    if not any(frame.camera_path for frame in frames):
+        raise UserError(f"none of {len(frames)} frames has a front image to embed")
     params = variables["params"][IMAGE_BACKBONE]
     fields = embedding_fields(model.options.image.to_dict())
     source = {"image": fields, "weights_sha256": weights_sha256(params)}
     records = Records.create(folder, model.feature_shape, dtype, source, "float32")
     keys = records.keys()
     images = [f for f in frames if f.camera_path is not None and f.key not in keys]
-    found = sum(frame.key in keys for frame in frames)
+    found = {f.key: f.camera_path for f in frames if f.key in keys}
+    warn_of_changes(records.folder, found)
+    if missing := len(frames) - len(images) - len(found):
+        _log.warning("%d of %d frames have no front image", missing, len(frames))
+    states = {frame.key: state_of([frame.camera_path]) for frame in images}
+    skipped: dict[str, str] = {}
 
     def read(frame: LabelledFrame) -> UInt8[np.ndarray, "H W 3"]:
         assert frame.camera_path is not None
-        return read_left_image(
-            frame.camera_path,
-            model.options.image.size,
-            resize=resize,
-            calibrated_size=frame.calibrated_size(),
-        )
+        size = model.options.image.size
+        try:
+            return read_left_image(
+                frame.camera_path,
+                size,
+                resize=resize,
+                calibrated_size=frame.calibrated_size(),
+            )
+        except (DataError, OSError) as error:
+            skipped[frame.key] = str(error)
+            return np.zeros((*size, 3), np.uint8)
 
     embed = jax.jit(lambda params, image: model.apply(params, image, method="embed"))
     params = jax.device_put({"params": {IMAGE_BACKBONE: params}})
@@ -88,11 +106,8 @@ def embed_dataset(
             features = np.asarray(embed(params, np.pad(batch, empty)))
             features = features.astype(records.dtype)
             for row, frame in enumerate(images[i * batch_size :][: len(batch)]):
-                records.write(frame.key, features[row])
+                if frame.key not in skipped:
+                    records.write(frame.key, features[row], states[frame.key])
             bar.update(len(batch))
-    return {
-        "frames": len(frames),
-        "embedded": len(images),
-        "found": found,
-        "missing": len(frames) - len(images) - found,
-    }
+    seconds = time.perf_counter() - began
+    return PreprocessReport(len(images) + len(found), len(found), skipped, seconds)

@@ -319,7 +319,14 @@ def open_data(config: Config) -> Data:
     simulate_missing(config)
     data = Data(config)
     _log.info("%s", data.frames.summary().to_text())
-    used = {f.key for name in ("train", "test") for f in data.frames.of_split(name)}
+    splits = [data.frames.of_split(name) for name in ("train", "test")]
+    used = {frame.key for split in splits for frame in split}
+    problems = [x for split in splits for x in split.summary().problems]
+    if lost := [text for kind, text in problems if kind == "label file missing"]:
+        _log.warning("frames of the splits without labels: %d: %s", len(lost), lost[0])
+    absent = "split entries of sequences that are not here"
+    if count := sum(split.counts[absent] for split in splits):
+        _log.info("%s: %d", absent, count)
     if unused := [frame.key for frame in data.split("all") if frame.key not in used]:
         _log.warning(
             "%d frames are not used, as they are in neither the train nor the test split; "

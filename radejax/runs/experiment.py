@@ -446,12 +446,17 @@ def checkpoint_info(
 def _invariants(frames: FrameSequence, frozen_sha256: str | None) -> JsonObject:
     """Returns properties of the data and frozen weights that a run must not change.
 
-    Folders may move. Therefore frames are identified by their keys, and the frozen
-    backbone by its weights.
+    Folders may move. Therefore frames are identified by their keys and labels, and the
+    frozen backbone by its weights.
     """
     keys = "\n".join(frame.key for frame in frames)
-    digest = hashlib.sha256(keys.encode()).hexdigest()[:16]
-    values = {"frames to train on": len(frames), "sha256 of their keys": digest}
+    labels = str(
+        [[*map(str, f.classes), np.round(f.boxes, 4).tolist()] for f in frames]
+    )
+    values: dict[str, Any] = {"frames to train on": len(frames)}
+    for name, text in (("keys", keys), ("labels", labels)):
+        digest = hashlib.sha256(text.encode()).hexdigest()[:16]
+        values[f"sha256 of their {name}"] = digest
     if frozen_sha256 is not None:
         values[FROZEN_BACKBONE] = frozen_sha256[:16]
     return values

@@ -25,7 +25,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from radejax.core import files
-from radejax.core.errors import UserError
+from radejax.core.errors import DataError, UserError
 from radejax.core.workers import default_workers, process_pool
 from radejax.data.kradar import write as kradar_write
 from radejax.data.kradar.folders import SIMULATION_MARKER
@@ -77,6 +77,7 @@ def simulate_dataset(
     Raises:
         UserError: `root` contains other files or a dataset of other options, the disk is full,
             or a worker was killed.
+        DataError: The dataset was finished and files of it are missing.
     """
     root = files.as_path(root)
     if _is_finished(root, options):
@@ -97,7 +98,7 @@ def simulate_dataset(
         with tqdm(None, "simulate", total, unit="frame", disable=not progress) as bar:
             bar.update(total - len(missing))
             writer.write_frames(missing, num_workers, bar)
-        files.write_json(root / SIMULATION_MARKER, content | {"finished": True})
+        files.write_json(root / SIMULATION_MARKER, content | {"finished": _count(root)})
     return root
 
 
@@ -116,6 +117,7 @@ def _is_finished(root: pathlib.Path, options: SimulationOptions) -> bool:
 
     Raises:
         UserError: `root` is a file, or contains other files or a dataset of other options.
+        DataError: The dataset was finished and files of it are missing.
     """
     if root.exists() and not root.is_dir():
         raise UserError(f"{root} is a file, expected a folder for the dataset")
@@ -129,7 +131,30 @@ def _is_finished(root: pathlib.Path, options: SimulationOptions) -> bool:
         return False
     what = "a dataset of another simulation config"
     files.claim(marker, _marker(options), what, ignore=("finished",))
-    return files.read_object(marker, "finished")["finished"] is True
+    finished = files.read_object(marker, "finished")["finished"]
+    if not isinstance(finished, dict):
+        return finished is True
+    there = _count(root)
+    # All radar data may have been deleted after `preprocess`, or be a reduced release.
+    has_radar = any("tesseract" in name for name in there)
+    for name, count in finished.items():
+        found = there.get(name, 0 if has_radar or "tesseract" not in name else count)
+        if found < count:
+            raise DataError(
+                f"{root} is not complete: {name} has {found} of {count} files; copy it "
+                "again, or delete the dataset to simulate it again"
+            )
+    return True
+
+
+def _count(root: pathlib.Path) -> dict[str, int]:
+    """Returns the number of files in every folder of a dataset."""
+    patterns = ("[0-9]*", "[0-9]*/*", "split", "calib/*")
+    folders = (p for pattern in patterns for p in root.glob(pattern) if p.is_dir())
+    return {
+        str(folder.relative_to(root)): len(list(folder.glob("[!.]*.*")))
+        for folder in sorted(folders)
+    }
 
 
 def _marker(options: SimulationOptions) -> files.JsonObject:

@@ -216,6 +216,8 @@ def test_points_of_two_disks(
     words = ("--to", "pcd", "--method", "cfar", "--threshold-db", 3)
     _run("points", radar, others, *words, "--sequences", 1, "--out", tmp_path / "c")
     assert len(list((tmp_path / "c").glob("1/rpc_*.pcd"))) == 4
+    text = _run("points", radar, others, "--out", tmp_path / "c", code=2).output
+    assert "holds other points: options.method is 'cfar' there and 'percent" in text
 
 
 @pytest.mark.slow

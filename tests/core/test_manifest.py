@@ -1,11 +1,18 @@
 """Descriptions of output folders."""
 
 import json
+import os
 
 import pytest
 
 from radejax.core.errors import DataError, UserError
-from radejax.core.manifest import Manifest, state_of
+from radejax.core.manifest import (
+    Manifest,
+    add,
+    read_sources,
+    state_of,
+    warn_of_changes,
+)
 
 
 def test_a_folder_without_a_description_has_no_manifest(tmp_path):
@@ -26,15 +33,48 @@ def test_what_several_calls_log_is_read_by_the_next_one(tmp_path):
     assert found.sources == {"a.json": state, "b.json": state}
     assert found.is_done("a.json")
     found.check_whole("*.json", "fix it")
-    with found.log():  # a call that writes nothing leaves no file
-        pass
-    assert len(list(job.glob("manifest.*.jsonl"))) == 2
 
 
-def test_an_incomplete_last_line_is_ignored(tmp_path):
-    Manifest.claim(tmp_path, "boxes", {})
-    (tmp_path / "manifest.1.jsonl").write_text('["a", []]\n["b", [["c.n')
-    assert Manifest.open(tmp_path).sources == {"a": []}
+def test_the_last_line_of_all_processes_holds_and_an_incomplete_one_is_ignored(
+    tmp_path,
+):
+    (tmp_path / "manifest.2.jsonl").write_text('[1, "a", []]\n[3, "b", [["c.n')
+    (tmp_path / "manifest.1.jsonl").write_text('[2, "a", [["x", 1, 2]]]\n[3]\n')
+    assert read_sources(tmp_path) == {"a": [["x", 1, 2]]}
+
+
+def test_files_of_which_the_source_has_changed_are_counted(tmp_path, caplog):
+    paths = {name: tmp_path / f"{name}.mat" for name in "abcdef"}
+    for name in "abcde":
+        paths[name].write_text(name)
+        if name != "e":  # of an unknown source
+            add(tmp_path, name, state_of([paths[name]]))
+    add(tmp_path, "f", [["f.mat", 1, 2]])  # is missing now
+    assert warn_of_changes(tmp_path, paths) == []
+    assert not caplog.messages
+    paths["b"].write_text("another size")
+    os.utime(paths["c"], (1, 1))
+    paths["d"] = paths["d"].rename(tmp_path / "d.npy")
+    assert warn_of_changes(tmp_path, paths) == ["b", "c", "d"]
+    (message,) = caplog.messages
+    assert f"{tmp_path}: 3 of 6 files were made from other files than" in message
+    assert "such as b: delete these, or the folder, and repeat" in message
+
+
+def test_a_folder_in_which_nothing_was_written_may_get_other_options(tmp_path):
+    def claim(what, step):
+        Manifest.claim(tmp_path / "out", what, {"step": step}, patterns=["*.npy"])
+
+    claim("points", 1)
+    claim("points", 2)
+    with pytest.raises(UserError, match="what is 'points' there and 'records' here"):
+        claim("records", 2)
+    (tmp_path / "out" / "a.npy").touch()
+    with pytest.raises(UserError, match=r"options\.step is 2 there and 1 here"):
+        claim("points", 1)
+    (tmp_path / "out" / "manifest.json").unlink()
+    with pytest.raises(UserError, match=r"a\.npy is there, but no manifest\.json that"):
+        claim("points", 2)
 
 
 @pytest.mark.parametrize(

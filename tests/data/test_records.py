@@ -15,7 +15,6 @@ import time
 import numpy as np
 import pytest
 
-from radejax.core import files
 from radejax.core.errors import DataError, UserError
 from radejax.data.dataset import LabelledFrames
 from radejax.data.kradar import KRadar
@@ -54,7 +53,7 @@ def run(data, out, **options):
 
 
 def contents(folder):
-    paths = (path for path in folder.rglob("*") if path.is_file())
+    paths = (path for path in folder.rglob("*.*") if path.suffix != ".jsonl")
     return {str(path.relative_to(folder)): path.read_bytes() for path in paths}
 
 
@@ -109,15 +108,19 @@ def test_corrupted_records_are_named(data, copy):
     ],
 )
 def test_corrupted_descriptions_are_named(copy, change, message):
-    path = copy / "records.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
-    with pytest.raises(DataError, match=rf"records\.json: .*{message}"):
+    path = copy / "manifest.json"
+    content = json.loads(path.read_text())
+    content["options"] |= change
+    path.write_text(json.dumps(content))
+    with pytest.raises(DataError, match=rf"manifest\.json: .*{message}"):
         _ = open_projections(copy).grid
     path.write_text("{")
     with pytest.raises(DataError, match="is not valid JSON"):
         open_projections(copy)
     path.unlink()
-    with pytest.raises(FileNotFoundError, match=r"no records\.json; expected a folder"):
+    with pytest.raises(
+        FileNotFoundError, match=r"no manifest\.json; expected a folder"
+    ):
         open_projections(copy)
 
 
@@ -253,6 +256,30 @@ def test_bad_frames_are_skipped_counted_and_tried_again(root, tmp_path):
     assert list(report.skipped) == ["2/00009_00006"]
 
 
+@pytest.mark.parametrize("num_workers", [0, 1])
+def test_records_of_tensors_that_were_replaced_are_counted(
+    root, tmp_path, caplog, num_workers
+):
+    out, path = tmp_path / "out", root / "1/radar_tesseract/tesseract_00005.mat"
+    for shard in (0, 1):
+        run(KRadar(root), out, shard=(shard, 2), num_workers=num_workers)
+    run(KRadar(root), out)
+    assert not caplog.messages
+    other = path.with_name("tesseract_00006.mat").read_bytes()
+    path.write_bytes(other)
+    before = contents(out)
+    for _ in range(2):  # the record stays until it is deleted
+        assert run(KRadar(root), out).num_found == 12
+        assert "out: 1 of 12 files were made from" in caplog.text
+        assert "such as 1/00005_00002: delete these" in caplog.text
+        caplog.clear()
+    assert contents(out) == before
+    (out / "1/00005_00002.npy").unlink()
+    assert run(KRadar(root), out).num_written == 1
+    run(KRadar(root), out)
+    assert not caplog.messages
+
+
 def test_released_projections_are_taken_as_input(root, tmp_path):
     wanted = {}
     for frame in KRadar(root):
@@ -280,9 +307,11 @@ def test_a_folder_has_records_of_one_kind(data, tmp_path):
     records = open_projections(tmp_path)
     exact = project_file(data[0].tesseract_path)
     assert np.abs(records[data[0].key] / 255 - exact).max() <= 0.5001 / 255
-    with pytest.raises(UserError, match=r"other records: dtype is 'uint8' there and"):
+    with pytest.raises(
+        UserError, match=r"other records: options\.dtype is 'uint8' there"
+    ):
         run(data, tmp_path, dtype="float16")
-    with pytest.raises(UserError, match=r"source\.grid\.azimuth_rad differs"):
+    with pytest.raises(UserError, match=r"options\.source\.grid\.azimuth_rad differs"):
         run(LabelledFrames(data, RadarGrid.kradar()), tmp_path)
 
 
@@ -318,11 +347,9 @@ def test_a_full_disk_keeps_nothing_half_written(data, tmp_path, monkeypatch):
     monkeypatch.setattr(np, "save", full)
     with pytest.raises((OSError, UserError), match=r"(?i)no space left"):
         run(data, tmp_path)
-    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == [
-        "records.json"
-    ]
+    assert list(contents(tmp_path)) == ["manifest.json"]
     assert Records.open(tmp_path).keys() == set()
-    assert files.read_json(tmp_path / "records.json")["dtype"] == "float16"
+    assert Records.open(tmp_path).dtype == "float16"
 
 
 def test_uneven_axes_are_kept_and_told_apart(tmp_path):

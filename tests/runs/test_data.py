@@ -120,6 +120,18 @@ def test_frames_are_projected_beside_their_data_once(
     assert written() == before
 
 
+def test_frames_of_the_splits_without_labels_are_counted(
+    root: pathlib.Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    min(root.glob("1/info_label_v2_1/*")).unlink()
+    shutil.rmtree(root / "3" / "info_label_v2_1")
+    with caplog.at_level("INFO", "radejax"):
+        _open(_config(root))
+    assert "frames of the splits without labels: 1: 1/000" in caplog.text
+    assert "1  sequences without labels" in caplog.text
+    assert "split entries of sequences that are not here: 2" in caplog.text
+
+
 def test_reduced_releases_are_read_with_and_without_doppler(
     root: pathlib.Path, tmp_path: pathlib.Path
 ) -> None:

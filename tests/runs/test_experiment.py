@@ -6,6 +6,7 @@ import pathlib
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from jax.sharding import Mesh
 
@@ -53,9 +54,12 @@ def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
     assert "radejax detect" in caplog.text
 
 
-def test_frames_and_frozen_weights_tell_whether_a_run_is_the_same() -> None:
-    def stays(keys: list[str], frozen: str | None = None) -> dict:
-        frames = [SimpleNamespace(key=key) for key in keys]
+def test_frames_labels_and_frozen_weights_tell_whether_a_run_is_the_same() -> None:
+    def stays(
+        keys: list[str], frozen: str | None = None, x: float = 1.0, cls: str = "Sedan"
+    ) -> dict:
+        box, classes = np.array([[x, 2, 3, 4, 2, 1.5, 0]]), np.array([cls])
+        frames = [SimpleNamespace(key=key, boxes=box, classes=classes) for key in keys]
         return experiment._invariants(frames, frozen)
 
     first = stays(["1/a", "1/b"])
@@ -64,7 +68,11 @@ def test_frames_and_frozen_weights_tell_whether_a_run_is_the_same() -> None:
     assert (
         first["sha256 of their keys"] != stays(["1/a", "1/c"])["sha256 of their keys"]
     )
-    assert len(first) == 2  # nothing is frozen
+    for other in (stays(["1/a", "1/b"], x=1.01), stays(["1/a", "1/b"], cls="Bus")):
+        assert [name for name in first if first[name] != other[name]] == [
+            "sha256 of their labels"
+        ]
+    assert len(first) == 3  # nothing is frozen
     assert stays(["1/a"], "0" * 64) == stays(["1/a"], "0" * 64)
     assert stays(["1/a"], "0" * 64) != stays(["1/a"], "1" * 64)
 

@@ -4,6 +4,7 @@ import hashlib
 import json
 import multiprocessing
 import os
+import shutil
 import subprocess
 import sys
 
@@ -14,7 +15,7 @@ from PIL import Image
 
 from radejax import Detector, models
 from radejax.core import files
-from radejax.core.errors import UserError
+from radejax.core.errors import DataError, UserError
 from radejax.data.cameras import CameraOptions, camera_inputs
 from radejax.data.kradar import KRadar, read_labels
 from radejax.data.kradar.check import check_dataset
@@ -151,6 +152,27 @@ class TestRepeating:
             dataset.Writer, "write_frames", lambda *a: pytest.fail("simulated again")
         )
         assert simulate_dataset(small_config(), tree, progress=False) == tree
+
+    @pytest.mark.parametrize(
+        ("lost", "message"),
+        [
+            ("2/cam-front/*1.png", "2/cam-front has 2 of 3 files; copy it again"),
+            ("1/info_label_v2_1/*2.txt", "1/info_label_v2_1 has 2 of 3 files"),
+            ("1/radar_tesseract/*3.mat", "1/radar_tesseract has 2 of 3 files"),
+            ("split/test.txt", "split has 1 of 2 files"),
+            ("3/description.txt", "3 has 0 of 1 files"),
+        ],
+    )
+    def test_an_incomplete_copy_is_an_error(self, tree, tmp_path, lost, message):
+        copy = shutil.copytree(tree, tmp_path / "copy")
+        min(copy.glob(lost)).unlink()
+        with pytest.raises(DataError, match=f"copy is not complete: {message}"):
+            simulate_dataset(small_config(), copy, progress=False)
+
+    def test_radar_data_may_be_deleted_after_preprocessing(self, tree, tmp_path):
+        left_out = shutil.ignore_patterns("radar_tesseract")
+        copy = shutil.copytree(tree, tmp_path / "copy", ignore=left_out)
+        assert simulate_dataset(small_config(), copy, progress=False) == copy
 
 
 class TestWrongUse:

@@ -147,9 +147,20 @@ def check_dataset(
             _check_conditions(number, own, summary)
         row = _row(number, folder, own, splits)
         rows.append(row | {"radar_corrupted": corrupted[number]})
+    _check_parts(rows, summary)
     names = [str(path) for path in data.files.roots]
     objects = _count_objects(data, splits)
     return HealthReport(names, data.files.options.version, rows, objects, summary)
+
+
+def _check_parts(rows: Rows, summary: Summary) -> None:
+    """Reports sequences without labels, radar data or images if other ones have them."""
+    for what in ("labels", "radar data", "images"):
+        names = ("tesseracts", "projections") if what == "radar data" else (what,)
+        lacking = [row["sequence"] for row in rows if not any(row[n] for n in names)]
+        if 0 < len(lacking) < len(rows):
+            numbers = ", ".join(map(str, lacking))
+            summary.report("sequences", f"sequences without {what}: {numbers}")
 
 
 def _tensors(folder: SequenceFolder) -> list[pathlib.Path]:

@@ -236,6 +236,9 @@ def keys_of_split(index: Index, split: PathLike | None) -> tuple[list[Key], Summ
     keys = [key for key in index.label_paths if key[0] in wanted]
     if numbers is None:
         absent = len(labelled - here)
+        summary.counts["sequences without labels"] = len(
+            set(index.sequences) - labelled
+        )
         rest = len(index.label_paths) - len(keys)
         summary.counts["sequences with labels that are not in the roots"] = absent
         summary.counts["frames of sequences that are not in the roots"] = rest

@@ -44,8 +44,11 @@ def find_frames(
     for path in map(files.as_path, paths):
         if not path.exists():
             raise FileNotFoundError(f"no such file or folder: {path}")
-        is_file = path.is_file()
-        found.update([path] if is_file else files.find_files(path, *PATTERNS))
+        found.update([path] if path.is_file() else files.find_files(path, *PATTERNS))
+        # Several sequences may be links to one folder, which is searched for each.
+        for folder in path.glob("[0-9]*/"):
+            if sequence_number(folder) is not None:
+                found.update(files.find_files(folder, *PATTERNS))
     folders = {sequence_folder(path) for path in found}
     if sequence_numbers:
         folders = {f for f in folders if sequence_number(f) in sequence_numbers}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import shutil
 import time
@@ -11,20 +10,15 @@ from collections.abc import Iterable
 import numpy as np
 from tqdm import tqdm
 
-from radejax.core.archives import read_npy
+from radejax.core import manifest
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import PathLike, as_path, atomic_write
-from radejax.data.kradar.folders import (
-    find_release,
-    find_sequences,
-    is_elevation_axis_up,
-    read_grid,
-)
-from radejax.data.kradar.reduced import polar_shape, strongest_points
+from radejax.data.kradar.folders import find_sequences, is_elevation_axis_up, read_grid
+from radejax.data.kradar.reduced import RELEASES, strongest_points
 from radejax.data.kradar.tesseract import check_axes, read_polar
 from radejax.data.records import PreprocessReport
 
-_LEFT_OUT = shutil.ignore_patterns("radar_tesseract", "DERA_tesseract", "records*")
+_LEFT_OUT = shutil.ignore_patterns("*_tesseract", "records*", "manifest.*")
 
 
 def reduce_dataset(
@@ -33,7 +27,8 @@ def reduce_dataset(
     """Writes a dataset with the frames of a reduced release instead of radar tensors.
 
     The other files of the roots become symbolic links. Existing files are kept, so that an
-    interrupted call can be repeated.
+    interrupted call can be repeated; those whose tensor has changed since are counted in a
+    warning.
 
     Args:
         roots: Folders that contain the sequences.
@@ -44,7 +39,8 @@ def reduce_dataset(
     Raises:
         FileNotFoundError: A root does not exist.
         UserError: The rate is out of its range, there are no tensors, the grid has too few
-            bins, or the new dataset has frames of another form or rate.
+            bins, or the new dataset has frames of another form or rate, or of unknown
+            ones.
         DataError: The folders are ambiguous.
     """
     require(0 < rate < 1, "rate", rate, "a number above 0 and below 1")
@@ -62,21 +58,18 @@ def reduce_dataset(
     if not targets:
         raise UserError(f"no radar_tesseract/*.mat in {', '.join(map(str, paths))}")
     missing = [path for path in targets if not targets[path].exists()]
-    if out.exists():
-        form = find_release(find_sequences([out]))
-        name = f"form of the radar data in {out}"
-        require(form in (None, release), name, form, release)
-    if release == "rpc" and (done := targets.keys() - set(missing)):
-        points = read_npy(targets[min(done)], mapped=True)
-        size = polar_shape(grid)[1:]
-        found = len(points) / math.prod(size)
-        is_same = abs(found - rate) < 0.1 * rate + 2 / math.prod(size)
-        require(is_same, "rate", rate, f"about {found:.3g}, as of the points in {out}")
+    options = {"release": release, "rate": rate if release == "rpc" else None}
+    patterns = [f"{name}_*.npy" for name in RELEASES]
+    manifest.Manifest.claim(out, "reduced frames", options, patterns=patterns)
+    names = {path: str(target.relative_to(out)) for path, target in targets.items()}
+    done = {names[path]: path for path in sorted(targets.keys() - set(missing))}
+    manifest.warn_of_changes(out, done)
     for root in paths:
         shutil.copytree(root, out, False, _LEFT_OUT, _link, dirs_exist_ok=True)
     is_axis_up = is_elevation_axis_up(paths)
     skipped = {}
     for path in tqdm(missing, "reduce", unit="frame"):
+        state = manifest.state_of([path])
         try:
             frame = read_polar(path, grid)
         except (DataError, OSError) as error:
@@ -84,6 +77,7 @@ def reduce_dataset(
             continue
         if release == "rpc":
             frame = strongest_points(frame, grid, rate, is_axis_up=is_axis_up)
+        manifest.add(out, names[path], state)
         with atomic_write(targets[path]) as file:
             np.save(file, frame)
     num_found = len(targets) - len(missing)

@@ -91,6 +91,28 @@ def test_everything_that_is_wrong_is_named(root, caplog):
     assert found[4] is not None
 
 
+@pytest.mark.parametrize(
+    ("folder", "message"),
+    [
+        ("info_label", "sequences without labels: 2"),
+        ("radar_tesseract", "sequences without radar data: 2"),
+        ("cam-front", "sequences without images: 2"),
+    ],
+)
+def test_a_sequence_that_lacks_what_others_have_is_listed(root, folder, message):
+    for number in ("1", "2"):
+        (root / number / "cam-front").mkdir()
+        (root / number / "cam-front/cam-front_00005.png").touch()
+    assert check_dataset(root).num_problems == 0
+    shutil.rmtree(root / "2" / folder)
+    (root / "2" / folder).write_text("../labels/2")  # a link that became a text file
+    report = check_dataset(root)
+    assert message in [text for kind, text in report.summary.problems]
+    assert f"problem: sequences: 1\n    {message}\n" in report.to_text()
+    counted = KRadar(root).counts["sequences without labels"]
+    assert counted == (folder == "info_label")
+
+
 def test_values_are_read_only_if_asked(root):
     grid = KRadar(root).grid
     path = root / "1/DERA_tesseract/DERA_tesseract_00005.npy"

@@ -61,15 +61,18 @@ def test_writing_resumes_and_lists_corrupted_tensors(kradar_root, tmp_path):
     assert report.skipped.keys() == {str(broken), str(decibels)}
     assert "not a MATLAB v5 file" in report.skipped[str(broken)]
     assert "as in decibels" in report.skipped[str(decibels)]
-    names = sorted(path.name for path in out.iterdir())
-    assert names == ["1", "2", "radar_grid.json", "split"]
+    (source / "manifest.json").touch()  # of another job
+    names = {path.name for path in out.iterdir() if path.suffix != ".jsonl"}
+    assert names == {"1", "2", "manifest.json", "radar_grid.json", "split"}
     assert (out / "1/description.txt").is_symlink()
     (out / "2/polar3d_00005.npy").unlink()
     again = reduce_dataset([source], out, "polar3d")
     assert (again.num_found, again.num_written, len(again.skipped)) == (9, 1, 2)
     with pytest.raises(UserError, match=r"rate is 1\.5, expected"):
         reduce_dataset([source], out, "rpc", 1.5)
-    with pytest.raises(UserError, match=r"form of the radar data in .* is 'polar3d'"):
+    with pytest.raises(
+        UserError, match=r"other reduced frames: .*release is 'polar3d' the"
+    ):
         reduce_dataset([source], out, "rpc")
     with pytest.raises(UserError, match=r"no radar_tesseract/\*\.mat in"):
         reduce_dataset([out], tmp_path / "again", "rpc")
@@ -81,9 +84,26 @@ def test_writing_resumes_and_lists_corrupted_tensors(kradar_root, tmp_path):
 def test_points_of_another_rate_are_not_mixed(kradar_root, tmp_path):
     out = reduced_root(kradar_root, tmp_path / "out", "rpc")
     (out / "2/rpc_00005.npy").unlink()
-    with pytest.raises(UserError, match=r"rate is 0\.1, expected about 0\.2, as of"):
+    with pytest.raises(UserError, match=r"options\.rate is 0\.2 there and 0\.1 here"):
         reduce_dataset([kradar_root], out, "rpc", 0.1)
     assert reduce_dataset([kradar_root], out, "rpc", 0.2).num_written == 1
+    for path in out.glob("manifest.*"):
+        path.unlink()
+    with pytest.raises(UserError, match=r"rpc_0000\d\.npy is there, but no manifest"):
+        reduce_dataset([kradar_root], out, "rpc", 0.2)
+
+
+def test_frames_of_tensors_that_were_replaced_are_counted(
+    kradar_root, tmp_path, caplog
+):
+    source = shutil.copytree(kradar_root, tmp_path / "in")
+    out = reduced_root(source, tmp_path / "out", "polar3d")
+    assert reduce_dataset([source], out, "polar3d").num_found == 12
+    assert not caplog.messages
+    (source / "2/radar_tesseract/tesseract_00005.mat").touch()
+    assert reduce_dataset([source], out, "polar3d").num_found == 12
+    assert "1 of 12 files were made from other files" in caplog.text
+    assert "such as 2/polar3d_00005.npy: delete these" in caplog.text
 
 
 def test_bad_and_missing_frames_are_found_and_skipped(kradar_root, tmp_path):
