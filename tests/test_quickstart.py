@@ -119,7 +119,7 @@ def _simulating(folder: pathlib.Path) -> bool:
 
 
 def _preprocessing(folder: pathlib.Path) -> bool:
-    return (folder / "data" / "records" / "records.json").exists()
+    return (folder / "data" / "records" / "manifest.json").exists()
 
 
 def _training(folder: pathlib.Path) -> bool:

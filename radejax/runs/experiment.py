@@ -450,13 +450,12 @@ def _invariants(frames: FrameSequence, frozen_sha256: str | None) -> JsonObject:
     frozen backbone by its weights.
     """
     keys = "\n".join(frame.key for frame in frames)
-    labels = str(
-        [[*map(str, f.classes), np.round(f.boxes, 4).tolist()] for f in frames]
-    )
+    classes = str([",".join(frame.classes) for frame in frames])
+    boxes = np.concatenate([np.reshape(frame.boxes, (-1, 7)) for frame in frames])
+    labels = classes.encode() + np.round(boxes, 4).tobytes()
     values: dict[str, Any] = {"frames to train on": len(frames)}
-    for name, text in (("keys", keys), ("labels", labels)):
-        digest = hashlib.sha256(text.encode()).hexdigest()[:16]
-        values[f"sha256 of their {name}"] = digest
+    for name, content in (("keys", keys.encode()), ("labels", labels)):
+        values[f"sha256 of their {name}"] = hashlib.sha256(content).hexdigest()[:16]
     if frozen_sha256 is not None:
         values[FROZEN_BACKBONE] = frozen_sha256[:16]
     return values

@@ -156,9 +156,9 @@ class TestRepeating:
     @pytest.mark.parametrize(
         ("lost", "message"),
         [
-            ("2/cam-front/*1.png", "2/cam-front has 2 of 3 files; copy it again"),
-            ("1/info_label_v2_1/*2.txt", "1/info_label_v2_1 has 2 of 3 files"),
-            ("1/radar_tesseract/*3.mat", "1/radar_tesseract has 2 of 3 files"),
+            ("2/cam-front/*.png", "2/cam-front has 2 of 3 files; copy it again"),
+            ("1/info_label_v2_1/*.txt", "1/info_label_v2_1 has 2 of 3 files"),
+            ("1/radar_tesseract/*.mat", "1/radar_tesseract has 2 of 3 files"),
             ("split/test.txt", "split has 1 of 2 files"),
             ("3/description.txt", "3 has 0 of 1 files"),
         ],
