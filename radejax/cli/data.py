@@ -122,9 +122,9 @@ def data() -> None:
 @click.option("--deep", is_flag=True, help="Read every radar tensor completely.")
 @entry.json_option
 def check(roots: tuple[str, ...], as_json: bool, **options: Any) -> None:
-    """Report what is there, what is missing and what is corrupted.
+    """Report what is there, and what is missing, corrupted or implausible.
 
-    Exit code 1 if anything is missing or corrupted.
+    Exit code 1 if anything is missing, corrupted or implausible.
 
     Example: radejax data check /disk1/kradar /disk2/kradar
     """

@@ -88,6 +88,8 @@ def detect(
     text = f"{count['boxes']} boxes in {count['frames']} frames written to {out}"
     if count["clipped"]:
         text += f"; {count['clipped']} with a size that was clipped to be positive"
+    if count["truncated"]:
+        text += f"; {count['truncated']} more dropped by config.decode.max_detections"
     if "repeated" in count:
         text += f"; {count['repeated']} without a preceding frame, which were repeated"
     if count.get("radar_only"):

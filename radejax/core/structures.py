@@ -176,6 +176,7 @@ class Detections(struct.PyTreeNode):
             box=np.asarray(self.boxes, np.float64)[position, row],
             cls=np.asarray(self.class_names, object)[cls].astype(str),
             score=np.asarray(self.scores, np.float64)[position, row],
+            num_truncated=int(np.asarray(self.num_truncated)[indices >= 0].sum()),
         )
 
     def to_list(self) -> list[list[JsonObject]]:
@@ -211,6 +212,8 @@ class Boxes:
         cls: Class names or class indices.
         score: float64 scores in [0, 1]; None for ground truth.
         extras: Further columns by name, with one row per box.
+        num_truncated: Number of boxes that the detector dropped because of its fixed number
+            of rows, see `Detections`; 0 if it is not known.
 
     Raises:
         DataError: Columns differ in length, or a value is not finite or out of range. In
@@ -224,6 +227,7 @@ class Boxes:
     extras: Mapping[str, Shaped[np.ndarray, "N ..."]] = dataclasses.field(
         default_factory=dict
     )
+    num_truncated: int = 0
 
     def __post_init__(self) -> None:
         count = len(self.frame)
@@ -281,9 +285,9 @@ class Boxes:
         """Returns the boxes of all parts, of which there is at least one, in their order."""
         tables = [part.columns() for part in parts]
         names = tables[0]
-        return cls.from_columns(
-            {name: np.concatenate([table[name] for table in tables]) for name in names}
-        )
+        joined = {n: np.concatenate([table[n] for table in tables]) for n in names}
+        total = sum(part.num_truncated for part in parts)
+        return dataclasses.replace(cls.from_columns(joined), num_truncated=total)
 
     def __len__(self) -> int:
         return len(self.frame)

@@ -18,6 +18,7 @@ from radejax.evaluation.boxes import Columns
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import pooled_curve
 from radejax.evaluation.results import condition_masks
+from radejax.geometry.boxes import MIN_OBJECTS, find_size_problem
 
 DISTANCES_M = (0.0, 20.0, 40.0, 60.0, 80.0, float("inf"))
 
@@ -220,8 +221,8 @@ MAX_BEHIND = 0.01
 MAX_OFFSET_M = 0.25
 """Median offset in meters above which a nearly constant offset is reported."""
 
-MIN_OBJECTS = 10
-"""Minimum number of objects with a prediction nearby from which the median is computed."""
+MIN_LIMIT = 20
+"""Smallest number of predictions per frame that is taken for a limit."""
 
 
 def sanity_checks(data: EvaluationSet) -> list[str]:
@@ -253,29 +254,44 @@ def sanity_checks(data: EvaluationSet) -> list[str]:
             f"{outside} of {outside + len(data.gt)} objects are outside the region "
             f"{data.roi} and not counted: --roi none, or evaluation.roi of the config"
         )
+    # Numbers of frames by their number of predictions.
+    counts = np.bincount(np.unique(data.predictions.frame, return_counts=True)[1])
+    if counts.size > MIN_LIMIT and counts[-1] > 2 + 2 * counts[-2]:
+        lines.append(
+            f"{counts[-1]} frames have {counts.size - 1} predictions and none has more: "
+            "others seem to be dropped at a limit, such as config.decode.max_detections"
+        )
     return lines + _constant_offset(data)
 
 
 def _constant_offset(data: EvaluationSet) -> list[str]:
-    """Warns if the best prediction near each object has a nearly constant offset."""
+    """Warns if the best prediction near each object has a constant offset or scale."""
     by_score = np.argsort(data.score[data.pair_pred], kind="stable")
     best = np.full(len(data.gt), -1)
     best[data.pair_gt[by_score]] = data.pair_pred[by_score]
     has = best >= 0
     if has.sum() < MIN_OBJECTS:
         return []
-    gap = data.pred.box[best[has], :3] - data.gt.box[has, :3]
+    lines = []
+    found, truth = data.pred.box[best[has]], data.gt.box[has]
+    if problem := find_size_problem(found[:, 3:6], truth[:, 3:6]):
+        lines.append(
+            f"predictions have {problem} of their objects (median); boxes have full extents"
+            " in meters, the length along the heading"
+        )
+    gap = found[:, :3] - truth[:, :3]
     median = np.median(gap, axis=0)
     spread = np.median(np.abs(gap - median), axis=0)
     is_constant = (np.abs(median) > MAX_OFFSET_M) & (np.abs(median) > 1.5 * spread)
     if not is_constant.any():
-        return []
+        return lines
     x, y, z = (f"{value:+.2f}" for value in median)
     hint = ""
     if is_constant[2]:
         hint = f"; --z-offset {-median[2]:.2f} of `radejax score` moves them"
     return [
+        *lines,
         f"predictions lie ({x}, {y}, {z}) m from their objects (x, y, z; median of "
         f"{has.sum()}); boxes are in the radar frame, which is K-Radar's "
-        f"LiDAR frame + (-2.54, 0.3, 0), with z at mid-height{hint}"
+        f"LiDAR frame + (-2.54, 0.3, 0), with z at mid-height{hint}",
     ]

@@ -15,7 +15,7 @@ import numpy as np
 
 from radejax.core import files
 from radejax.core.archives import read_npz
-from radejax.core.errors import DataError, UserError
+from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import JsonObject, PathLike
 from radejax.core.options import Options, as_tuples
 from radejax.core.structures import BOX_FIELDS, Boxes
@@ -160,8 +160,8 @@ def load(
         Ground truth, predictions, frame table, and counts of what was read and skipped.
 
     Raises:
-        UserError: There is no ground truth, or no frame of the chosen sequences or
-            weathers.
+        UserError: There is no ground truth, no frame of the chosen sequences or
+            weathers, or a class is neither K-Radar's nor in the ground truth.
         FileNotFoundError: A file or folder does not exist.
         DataError: A file has malformed content.
     """
@@ -169,7 +169,11 @@ def load(
     if (path / "predictions.npz").is_file():
         source = source.replace(ground_truth=str(path))
         path = path / "predictions.npz"
+    known = {*boxes.KNOWN_CLASSES, *stored_options(path).get("classes", ())}
     truth, given, left_out = _load_ground_truth(path, source, classes)
+    known |= set(truth.cls.tolist())
+    expected = f"some of {', '.join(sorted(known))}"
+    require(known.issuperset(classes), "classes", classes, expected)
     found = read_table(path, given)
     frames = given or {"frame": np.union1d(truth.frame, found.frame)}
     box = found.box.copy()

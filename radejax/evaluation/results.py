@@ -185,9 +185,9 @@ def make_set(
         UserError: An option is invalid, or a column is missing.
         DataError: A row is invalid; the message names the table, frame and row.
     """
+    num_truncated = predictions.num_truncated if isinstance(predictions, Boxes) else 0
     predictions, num_invalid = repair_sizes(predictions, options.invalid_sizes)
-    sizes = predictions.box[:, 3:6]
-    is_clipped = ((sizes > 1e-6) & (sizes <= np.float32(MIN_SIZE_M))).any(axis=1)
+    num_clipped = int(predictions.is_clipped.sum()) - num_invalid
     data = EvaluationSet(
         ground_truth,
         predictions,
@@ -198,7 +198,8 @@ def make_set(
     )
     data.left_out |= {
         "predictions: size not positive, kept as false positives": num_invalid,
-        f"predictions: size clipped to {MIN_SIZE_M} m, kept": int(is_clipped.sum()),
+        f"predictions: size clipped to {MIN_SIZE_M} m, kept": num_clipped,
+        "predictions: dropped at max_detections, as far as known": num_truncated,
     }
     return data
 
@@ -362,11 +363,13 @@ def exclusion_counts(data: EvaluationSet, options: ReportOptions) -> dict[str, i
     is_other = data.gt_count[data.pred.frame, data.pred.cls] == 0
     in_empty = is_empty[data.pred.frame] & is_kept
     in_other = is_other & is_kept
+    is_unknown = data.gt_count.sum(axis=0)[data.pred.cls] == 0
     masks = {
         f"predictions: score not above {threshold:g}{but}": ~is_kept,
         "frames: without ground truth (ignored by skip=frame)": is_empty,
         "predictions: in frames without ground truth (ignored by skip=frame)": in_empty,
         "predictions: in frames without their class (ignored by skip=class)": in_other,
+        "predictions: of classes without ground truth, which have no AP": is_unknown,
     }
     return data.left_out | {what: int(mask.sum()) for what, mask in masks.items()}
 

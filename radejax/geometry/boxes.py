@@ -15,6 +15,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Real
 
+MIN_OBJECTS = 10
+"""Number of objects from which medians are compared."""
+
+MAX_SCALE = 1.6
+"""Largest plausible ratio of the sizes of two sets of boxes. The sizes in one sequence of
+K-Radar's labels and in all differ by up to 1.5; of half sizes, the ratio is 2."""
+
+MIN_SLENDERNESS = 0.3
+"""Smallest plausible ratio of length and width, relative to the usual one. In one sequence of
+K-Radar's labels, it is 0.43; with both exchanged, it is about 0.2 for cars."""
+
 ArrayT = TypeVar("ArrayT", np.ndarray, jax.Array)
 """An array type, NumPy's or JAX's, that is the same for input and output."""
 
@@ -166,3 +177,31 @@ def _checked(boxes: ArrayT, width: int) -> ArrayT:
     if boxes.ndim < 1 or boxes.shape[-1] != width:
         raise ValueError(f"boxes must be [..., {width}], got shape {boxes.shape}")
     return boxes
+
+
+def find_size_problem(
+    sizes_m: Float[np.ndarray, "N 3"], usual_m: Float[np.ndarray, "N 3"]
+) -> str | None:
+    """Describes why the sizes of boxes cannot be meant; returns None if they can.
+
+    They cannot if they are too large or too small as a whole, or length and width seem to be
+    exchanged.
+
+    Args:
+        sizes_m: Length, width and height of every box.
+        usual_m: Sizes that are usual for these boxes, such as those of the ground truth.
+
+    Examples:
+        >>> usual_m = np.array([[4.0, 2.0, 1.5], [10.0, 3.0, 3.5]])
+        >>> find_size_problem(usual_m + 0.1, usual_m)
+        >>> find_size_problem(usual_m / 2, usual_m)
+        '0.50, 0.50, 0.50 times the length, width and height'
+        >>> find_size_problem(usual_m[:, [1, 0, 2]], usual_m)
+        '0.40, 2.67, 1.00 times the length, width and height'
+    """
+    ratio = np.median(sizes_m / usual_m, axis=0)
+    scale = np.prod(ratio) ** (1 / 3)
+    if 1 / MAX_SCALE <= scale <= MAX_SCALE and ratio[0] > MIN_SLENDERNESS * ratio[1]:
+        return None
+    ratios = ", ".join(f"{x:.2f}" for x in ratio)
+    return f"{ratios} times the length, width and height"

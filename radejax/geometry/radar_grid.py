@@ -128,7 +128,8 @@ class RadarGrid(ArrayValues):
     Raises:
         ValueError: Range or azimuth has fewer than 2 bins, elevation and Doppler are both
             empty, an axis is not monotonic or has a value above 10,000, ranges decrease,
-            or a limit of the field of view is not in (0, 10,000].
+            or a limit of the field of view is not in (0, 10,000], or above twice the
+            end of its axis, as if they had different units.
 
     References:
         Sensor axes: Paek et al., K-Radar, arXiv:2206.08171.
@@ -166,8 +167,10 @@ class RadarGrid(ArrayValues):
         for name in ("fov_range_m", "fov_azimuth_rad"):
             value = getattr(self, name)
             limit = np.pi if name.endswith("_rad") else _MAX_VALUE
+            limit = min(limit, 2 * np.abs(getattr(self, name[len("fov_") :])).max())
             if not 0 < value <= limit:
-                raise ValueError(f"{name} must be positive, to {limit:g}, got {value}")
+                message = f"positive, to {limit:g} for its axis, got {value}"
+                raise ValueError(f"{name} must be {message}")
 
     # Construction --------------------------------------------------------------------
 

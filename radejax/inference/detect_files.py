@@ -255,8 +255,9 @@ def detect_files(
             the records.
 
     Returns:
-        The numbers of "frames" that did not fail, of "boxes" and of "clipped" boxes, whose
-        size was clipped; and the reasons of failed frames by key.
+        The numbers of "frames" that did not fail, of "boxes", of "clipped" boxes, whose size
+        was clipped, and of "truncated" ones, which are not written because of
+        `max_detections`; and the reasons of failed frames by key.
         For a model of several frames, "repeated" is the number of frames that repeat
         themselves, as there is no preceding one. For a radar-camera model, "radar_only" is
         the number of frames without a label file, image or calibration.
@@ -277,7 +278,7 @@ def detect_files(
     batches = (((np.array(rows), inputs.item(rows)) for rows in part) for part in parts)
     found = [Boxes.one_frame([], [], [])]
     failed = dict[str, str]()
-    count = {"frames": 0, "boxes": 0, "clipped": 0}
+    count = {"frames": 0, "boxes": 0, "clipped": 0, "truncated": 0}
     results = detect_batches(detector, batches, len(keys), progress=True)
     for frames, detections in results:
         on_host = jax.device_get(detections)
@@ -294,6 +295,7 @@ def detect_files(
                 continue
             count["frames"] += 1
             count["boxes"] += len(boxes)
+            count["truncated"] += boxes.num_truncated
             count["clipped"] += int(boxes.is_clipped.sum())
             if file_format == "csv":
                 found.append(boxes)

@@ -157,6 +157,7 @@ class Detector:
         self._set_batch_sizes(batch_sizes)
         self.variables = jax.device_put(saved.variables, self.replicated)
         self.num_radar_only = self.num_invalid_frames = 0
+        self._num_unchecked = 3 if saved.usual_input else 0  # calls
         self._lock = threading.Lock()
         # Every process gets all detections: they are small.
         self._run = jax.jit(run, out_shardings=self.replicated)
@@ -273,7 +274,7 @@ class Detector:
         if isinstance(frames, Batch):
             inputs = Inputs(frames.projection, frames.image, frames.camera)
         else:
-            radar = self._reader.read_radar(frames, self.num_frames)
+            radar = self._read_radar(frames, self.num_frames)
             if self.num_frames > 1:
                 radar = self._stacked(radar)
             else:
@@ -294,6 +295,17 @@ class Detector:
             return parts[0]
         found: Detections = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
         return found
+
+    def _read_radar(self, frames: Frames, num_frames: int = 1) -> Real[Any, "B ..."]:
+        """Read radar data, and compare a frame of the first calls with the training's."""
+        radar = self._reader.read_radar(frames, num_frames)
+        # Those of `warmup` are all 0.
+        if self._num_unchecked and isinstance(radar, np.ndarray) and radar.any():
+            frame = jnp.asarray(radar[0])
+            levels = project_jax(frame) if frame.ndim == 4 else to_float(frame)
+            is_usual = self.saved.check_input(float(levels.mean()), float(levels.std()))
+            self._num_unchecked = self._num_unchecked - 1 if is_usual else 0
+        return radar
 
     def _detect(
         self, inputs: Inputs, settings: Settings, is_checked: bool
@@ -364,7 +376,7 @@ class Detector:
             frames: Single frames as arrays or paths.
             history: The last T - 1 projections, or None before the first frame.
         """
-        new = self._projections(self._reader.read_radar(frames))
+        new = self._projections(self._read_radar(frames))
         past = self.num_frames - 1
         if history is None:
             history = np.repeat(new[:1], past, axis=0)

@@ -16,7 +16,7 @@ import dataclasses
 import hashlib
 import logging
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -50,6 +50,13 @@ FORMAT = "radejax-2"
 FROZEN_BACKBONE = "sha256 of the frozen image backbone"
 """Key of the first 16 digits of the checksum in a checkpoint's description of its run."""
 
+MAX_SHIFT = 1.0
+"""Largest plausible difference of the mean input from that of the training, in standard
+deviations of that. Those of simulated frames differ by up to 0.35; a gain of 8 to 11 dB is 1."""
+
+MAX_SPREAD = 2.0
+"""Largest plausible ratio of standard deviations; for simulated frames, it is up to 1.4."""
+
 Step = int | Literal["best"] | None
 """Step of a checkpoint, "best" by the metric of the run, or None for the latest."""
 
@@ -67,6 +74,8 @@ class SavedModel:
         run: Data, frozen weights and versions of the run, see
             `radejax.runs.experiment.checkpoint_info`; empty if the model is not from a
             checkpoint.
+        usual_input: Mean and standard deviation of the projections that the model was
+            trained on; None if they are not known.
     """
 
     config: Config
@@ -74,11 +83,30 @@ class SavedModel:
     variables: VariableDict
     step: int | None = None
     run: JsonObject = dataclasses.field(default_factory=dict)
+    usual_input: Sequence[float] | None = None
 
     @property
     def model(self) -> RadeNet:
         """The Flax module, without parameters."""
         return models.build(self.config.model, self.config.data.num_frames)
+
+    def check_input(self, mean: float, spread: float) -> bool:
+        """Return whether the input is similar to that of the training; warn if it is not.
+
+        Args:
+            mean: Mean of some projections.
+            spread: Their standard deviation.
+        """
+        usual, scale = self.usual_input or (mean, spread)
+        is_near = abs(mean - usual) <= MAX_SHIFT * scale
+        is_near = is_near and scale <= MAX_SPREAD * spread <= MAX_SPREAD**2 * scale
+        if not is_near:
+            _log.warning(
+                "the input is %.3f ± %.3f, and %.3f ± %.3f in the training: detections are "
+                "not reliable; expected linear power of a radar with the same gain",
+                *(mean, spread, usual, scale),
+            )
+        return is_near
 
 
 def load_model(
@@ -217,6 +245,7 @@ def save_model(
         "radejax": radejax.__version__,
         "config": saved.config.without_data_paths(),
         "grid": saved.grid.to_dict(),
+        "input": saved.usual_input,
         "left_out": [f"params/{IMAGE_BACKBONE}"] if is_incomplete else [],
         "sha256": {k: hashlib.sha256(v).hexdigest() for k, v in contents.items()},
     }
@@ -242,7 +271,8 @@ def _read_exported(folder: pathlib.Path) -> SavedModel:
         arrays = {name: value.astype(np.float32) for name, value in arrays.items()}
         variables = unflatten_dict(arrays, sep="/")
         config = Config(**content["config"])
-        saved = SavedModel(config, RadarGrid.from_dict(content["grid"]), variables)
+        grid, usual = RadarGrid.from_dict(content["grid"]), content.get("input")
+        saved = SavedModel(config, grid, variables, usual_input=usual)
         image_backbone.check_fits(saved.model, variables, weights)
         return saved
     # These are raised for a file that was edited by hand.
@@ -284,6 +314,7 @@ def _read_checkpoint(path: pathlib.Path, step: Step) -> SavedModel:
         {"params": params, **(state.get("model_state") or {})},
         number,
         {**info["same"], **info["run"]},
+        info["run"].get("input"),
     )
 
 

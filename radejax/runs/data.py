@@ -184,6 +184,13 @@ class Data:
         """
         return "validation" if self.options.validation else "test"
 
+    def input_of(self, split: str) -> tuple[float, float]:
+        """Return mean and standard deviation of the records of some frames of a split."""
+        frames = list(self.split(split))
+        some = frames[:: -(-len(frames) // _INPUT_FRAMES)]
+        values = np.stack([decode(self.records[frame.key]) for frame in some])
+        return float(values.mean()), float(values.std())
+
     def images(self, frames: FrameSequence) -> cameras.CameraInputs | None:
         """Return the images and cameras of frames, or None for a radar-only model.
 
@@ -362,12 +369,8 @@ def open_data(config: Config) -> Data:
 
 def _log_input(data: Data, model: RadeNetOptions) -> None:
     """Log mean and standard deviation of the input; warn if it is nearly constant."""
-    frames = list(data.split("train"))
-    some = frames[:: -(-len(frames) // _INPUT_FRAMES)]
-    values = np.stack([decode(data.records[frame.key]) for frame in some])
-    mean = float(values.mean())
-    spread = float(values.std())
-    _log.info("input: %.3f ± %.3f in %d frames to train on", mean, spread, len(some))
+    mean, spread = data.input_of("train")
+    _log.info("input: %.3f ± %.3f in the frames to train on", mean, spread)
     seen = model.input_scale * (mean - model.input_center)
     is_unusual = abs(seen - _KRADAR_INPUT) > 0.1
     if is_unusual and model.input_scale * spread < 0.05:

@@ -358,6 +358,7 @@ def evaluate_run(
         if out is None:
             _check_source(workdir / name, source_of(data, split, shuffle_images))
     data.preprocess()
+    saved.check_input(*data.input_of(split))
     evaluation = Evaluation(
         config, data, split, shuffle_images=shuffle_images, options=options
     )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from radejax.data.kradar import write
-from radejax.data.kradar.labels import LABEL_CLASSES, Label
+from radejax.data.kradar.labels import LABEL_CLASSES, MEDIAN_SIZES_M, Label
 from radejax.geometry.radar_grid import RadarGrid
 
 GRID = RadarGrid.reduced(num_doppler=6, num_range=16, num_elevation=5, num_azimuth=12)
@@ -17,8 +17,9 @@ def make_labels(rng: np.random.Generator, number: int) -> list[Label]:
     labels = []
     for track_id in range(number):
         x, y = rng.uniform(10, 60), rng.uniform(-6, 6)
-        box = (x, y, rng.uniform(-1, 1), *rng.uniform(0.5, 4, 3), rng.uniform(-4, 4))
+        z, scale, yaw = rng.uniform(-1, 1), rng.uniform(0.7, 1.4, 3), rng.uniform(-4, 4)
         cls = LABEL_CLASSES[rng.integers(7)]
+        box = (x, y, z, *scale * MEDIAN_SIZES_M[cls], yaw)
         visibility = rng.choice(["R", "R", "L", "L1"])
         labels.append(Label(cls, tuple(map(float, box)), str(visibility), track_id))
     return labels

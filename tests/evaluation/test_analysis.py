@@ -140,6 +140,13 @@ def _moved(found, column, change):
         ),
         (0, lambda x: x + 2.54, r"\(\+2.\d\d, .* LiDAR frame \+ \(-2.54, 0.3, 0\)"),
         (0, np.negative, r"60 of 60 predictions lie behind the sensor \(x < 0\)"),
+        ([3, 4, 5], lambda size: size / 2, r"have 0.5\d, 0.5\d, 0.5\d times"),
+        (
+            [3, 4, 5],
+            lambda size: 2 * size,
+            r"have [12].\d\d, [12].\d\d, [12].\d\d times",
+        ),
+        ([3, 4], lambda size: size[:, ::-1], r"have 0.4\d, 2.\d\d, 1.0\d times"),
     ],
 )
 def test_another_unit_or_frame_is_reported(column, change, expected):
@@ -159,6 +166,19 @@ def test_a_correction_removes_the_warning(tmp_path):
     np.testing.assert_allclose(right.box, found["box"])
     made = write_report(truth, right, frames, tmp_path, options)
     assert made.metrics["warnings"] == []
+
+
+def test_a_limit_of_predictions_per_frame_is_reported():
+    truth, found = _scene()
+    rows = np.repeat(np.arange(60), np.linspace(20, 40, 60).astype(int))
+    many = {name: column[rows] for name, column in found.items()}
+    assert _warnings(many, truth) == []
+    position = np.concatenate([np.arange(n) for n in np.bincount(rows)])
+    cut = {name: column[position < 30] for name, column in many.items()}
+    (line,) = _warnings(cut, truth)
+    assert line.startswith(
+        "30 frames have 30 predictions and none has more: others seem"
+    )
 
 
 def test_few_or_scattered_predictions_are_no_offset():

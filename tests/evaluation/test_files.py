@@ -270,6 +270,28 @@ def test_scoring_a_run_repeats_its_report(two_runs, tmp_path):
     assert "holds several seeds" in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("classes", "message"),
+    [
+        ("Car", "classes is ('Car',), expected some of Bicycle, "),
+        ("sedan,Sedan", "classes is ('sedan', 'Sedan'), expected some of Bicycle, "),
+        ("Tram,Bicycle", None),  # one is in the ground truth, the other K-Radar's
+    ],
+)
+def test_classes_that_do_not_exist_are_wrong_use(
+    tmp_path, write_table, classes, message
+):
+    table = {"frame": [0], "box": [BOX], "cls": ["Tram"]}
+    ids = {"frame": np.array([0])}
+    write_table(tmp_path / "found.json", {**table, "score": [0.5]}, ids)
+    write_table(tmp_path / "truth.json", table, ids)
+    words = ["score", tmp_path / "found.json", "--classes", classes]
+    words += ["--ground-truth", tmp_path / "truth.json", "--protocols", "all_point"]
+    done = CliRunner().invoke(main, [str(word) for word in words])
+    assert done.exit_code == (2 if message else 0)
+    assert (message or "") in done.stderr
+
+
 def test_own_classes_need_no_option(stored, write_table):
     run = stored[0] / "run"
     table = {"frame": [0], "box": [BOX], "cls": ["Tram"]}

@@ -1,8 +1,11 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
 from radejax.core.errors import UserError
-from radejax.evaluation.boxes import take
+from radejax.core.structures import Boxes
+from radejax.evaluation.boxes import read_boxes, take
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOLS
 from radejax.evaluation.results import (
@@ -124,13 +127,27 @@ def test_excluded_boxes_and_frames_are_counted(scene):
     assert kept == len(truth["frame"])
     above, empty = data.pred.score > 0.3, ~np.isin(np.arange(30), data.gt.frame)
     used = data.results("coco101", score_threshold=0.3, spaces="3d")
-    assert list(counts.values())[-4:] == [
+    assert list(counts.values())[-5:] == [
         (~above).sum(),
         empty.sum(),
         (empty[data.pred.frame] & above).sum(),
         above.sum() - sum(result.num_det for result in used),
+        0,
     ]
     assert "predictions: score not above 0.3 (counted by all_point)" in counts
+
+
+def test_dropped_predictions_and_classes_without_objects_are_counted(scene):
+    truth, found, frames = scene
+    names = np.where(np.arange(len(found["cls"])) < 3, "Bicycle", found["cls"])
+    found = read_boxes({**found, "cls": names}, "predictions", scored=True)
+    parts = [dataclasses.replace(found.take([i]), num_truncated=i) for i in (0, 1, 2)]
+    found = Boxes.concatenate([*parts, found])
+    options = ReportOptions(roi=None)
+    counts = exclusion_counts(make_set(truth, found, frames, options), options)
+    assert counts["predictions: dropped at max_detections, as far as known"] == 3
+    what = "predictions: of classes without ground truth, which have no AP"
+    assert counts[what] == 6
 
 
 def test_folders_are_named_after_options_that_change_numbers():

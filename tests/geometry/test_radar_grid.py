@@ -130,8 +130,9 @@ def test_values_survive_json_and_compare_and_hash():
         ("elevation_rad", [0, 1e300], "must be finite"),
         ("doppler_mps", np.zeros((2, 2)), "must be a vector"),
         ("doppler_mps", [0.0, np.nan], "must be finite"),
-        ("fov_range_m", np.nan, "must be positive, to 10000, got nan"),
-        ("fov_azimuth_rad", 53.0, "must be positive, to 3.14159, got"),
+        ("fov_range_m", np.nan, "must be positive, to 236.074 for its axis, got nan"),
+        ("range_m", np.linspace(0, 0.118, 9), "must be positive, to 0.236 for its"),
+        ("fov_azimuth_rad", 53.0, "must be positive, to 1.85005 for its axis, got"),
     ],
 )
 def test_bad_axes_are_rejected(name, value, message):
@@ -186,7 +187,8 @@ def test_bins_and_meters_are_inverse_on_any_axis(range_bin, azimuth_bin, grid):
 
 
 def test_positions_between_bins_by_hand():
-    grid = dataclasses.replace(UNEVEN, range_m=np.array([1.0, 2.0, 4.0, 8.0]))
+    range_m = np.array([1.0, 2.0, 4.0, 8.0])
+    grid = dataclasses.replace(UNEVEN, range_m=range_m, fov_range_m=8.0)
     bins = np.array([-1.0, 0.5, 1.5, 3.0, 4.0]), np.full(5, 20.0)
     for found in (grid.bin_to_ego(*bins), jax.jit(grid.bin_to_ego)(*bins)):
         np.testing.assert_allclose(found[:, 0], [0.0, 1.5, 3.0, 8.0, 12.0], rtol=1e-6)

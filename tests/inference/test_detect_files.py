@@ -46,7 +46,10 @@ def test_every_format_has_the_same_boxes(tmp_path):
         )
         clipped = int(detector(frames).to_boxes().is_clipped.sum())
         num_boxes = sum(map(len, expected))
-        assert count == {"frames": 3, "boxes": num_boxes, "clipped": clipped}
+        truncated = int(detector(frames).num_truncated.sum())
+        wanted = {"boxes": num_boxes, "clipped": clipped, "truncated": truncated}
+        assert count == {"frames": 3, **wanted}
+        assert truncated > 0
         assert failed == {}
     rows = [
         {"frame": key, **box}

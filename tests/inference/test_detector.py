@@ -1,5 +1,7 @@
 """`Detector`: inputs it takes, thresholds, batches without recompiling."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -184,6 +186,35 @@ def test_invalid_frames_are_counted_and_warned_of_once(
     assert count(levels)[0] == 3
     # Neither stored levels nor arrays on a device are checked.
     assert count((255 * projections[:3]).astype(np.uint8), jnp.asarray(levels))[0] == 0
+
+
+def test_input_unlike_that_of_the_training_is_warned_of_once(
+    detector, tesseracts, projections, tmp_path, caplog
+):
+    usual = [float(projections.mean()), float(projections.std())]
+    saved = dataclasses.replace(detector.saved, usual_input=usual)
+    path = tmp_path / "tesseract_00001.mat"
+    write.write_tesseract(path, 1e4 * tesseracts[0])
+    for frames, is_near in (
+        (projections, True),
+        (tesseracts[:1], True),
+        ((255 * projections).round().astype(np.uint8), True),
+        (projections + 0.01, True),
+        (tesseracts[:1] * 1e4, False),
+        (path, False),
+        (projections * 0.3, False),
+        (projections.mean() + 3 * (projections - projections.mean()), False),
+        (jnp.asarray(projections * 0.3), True),  # those on a device are not checked
+    ):
+        made = Detector(saved, batch_sizes=(1, 4)).warmup()
+        caplog.clear()
+        for _ in range(2):
+            made(frames)
+        assert caplog.text.count("in the training: detections") == (not is_near)
+    made = Detector(saved, batch_sizes=(1, 4))
+    for frames in (projections, projections, projections, projections + 1):
+        made(frames)
+    assert "in the training" not in caplog.text  # only the first calls are checked
 
 
 def test_arrays_of_other_kinds(detector, tesseracts):

@@ -68,7 +68,8 @@ def test_a_torch_file_is_loaded_like_a_folder(tmp_path):
 def test_classes_reordered_in_a_workdir_change_nothing_or_are_rejected(tmp_path):
     """A checkpoint has its own config; a training compares its config with the folder's."""
     config, grid = small.radar_config(), small.small_grid()
-    info = experiment.checkpoint_info(config, grid, {}, {})
+    run = {"input": [0.5, 0.125]}
+    info = experiment.checkpoint_info(config, grid, run, {})
     state = {"params": small.detector().variables["params"]}
     positions = iter(grain.MapDataset.range(9).to_iter_dataset())
     with (
@@ -81,6 +82,7 @@ def test_classes_reordered_in_a_workdir_change_nothing_or_are_rejected(tmp_path)
     content["classes"].reverse()
     path.write_text(json.dumps(content))
     assert load_model(tmp_path).config == config
+    assert load_model(tmp_path).usual_input == [0.5, 0.125]
     with (
         pytest.raises(UserError, match="a run with another config: config"),
         experiment.claimed(tmp_path, config),
@@ -120,8 +122,10 @@ def test_a_frozen_backbone_is_known_by_its_weights(tmp_path):
 def test_an_exported_radar_model_gives_the_same_boxes(tmp_path):
     model = small.saved(data__azimuth_mapping="stretched", seed=3)
     detector = Detector(model, nms_iou=0.2, score_threshold=0.1, batch_sizes=(4,))
-    content = save_model(detector.saved, tmp_path)
+    saved = dataclasses.replace(detector.saved, usual_input=(0.5, 0.125))
+    content = save_model(saved, tmp_path)
     assert content["left_out"] == []
+    assert load_model(tmp_path).usual_input == [0.5, 0.125]
     names = sorted(path.name for path in tmp_path.iterdir())
     assert names == ["config.json", "model.safetensors"]
     loaded = Detector.from_workdir(tmp_path, batch_sizes=(4,))

@@ -101,7 +101,9 @@ def test_frames_are_projected_beside_their_data_once(
     config = _config("sim", batch_size=4)
     with caplog.at_level("INFO", "radejax"):
         data = _open(config)
-        assert re.search(r"input: 0\.64\d ± 0\.04\d in 4 frames to train", caplog.text)
+        assert re.search(
+            r"input: 0\.64\d ± 0\.04\d in the frames to train", caplog.text
+        )
         assert "nearly constant" not in caplog.text
         _open(config.replace(model={"input_center": 0.4}))
     assert "set --config.model.input_center=0.64" in caplog.text

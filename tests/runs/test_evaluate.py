@@ -20,6 +20,12 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.runs import evaluate
 from radejax.runs.evaluate import report_options
 
+DATA: dict[str, Any] = {
+    "choosing_split": "test",
+    "preprocess": lambda: None,
+    "input_of": lambda split: ("mean", split),
+}
+
 
 def _shuffled(paths: list[str | None], seed: int) -> list[Any]:
     """Frames 0, 1, ... with images (and calibrations) of these names, shuffled."""
@@ -106,8 +112,10 @@ def evaluated(
 
     def run(choosing: str, **options: Any) -> dict[str, Any]:
         written: dict[str, Any] = {}
-        data = SimpleNamespace(choosing_split=choosing, preprocess=lambda: None)
-        loaded = SimpleNamespace(config=Config(), run="run", variables=None, step=3)
+        data = SimpleNamespace(**DATA | {"choosing_split": choosing})
+        saved = {"run": "run", "variables": None, "step": 3}
+        saved["check_input"] = lambda *found: written.update(compared=found)
+        loaded = SimpleNamespace(config=Config(), **saved)
         evaluation = SimpleNamespace(report=lambda *_, **named: written.update(named))
         monkeypatch.setattr(evaluate, "load_model", lambda *_, **__: loaded)
         monkeypatch.setattr(evaluate, "data_of_run", lambda *_: (loaded.config, data))
@@ -151,4 +159,5 @@ def test_folder_and_remark_follow_the_options(
     assert pathlib.Path(written["out"]) == pathlib.Path(expected)
     name = f"{tmp_path.name} ({remark})" if remark else tmp_path.name
     assert written["run"] == name
+    assert written["compared"] == ("mean", options.get("split", "test"))
     assert ("may not be reported" in caplog.text) == bool(remark)

@@ -135,6 +135,11 @@ def test_a_run_of_two_frames(
     detector = Detector.from_workdir(folder, score_threshold=0.0, batch_sizes=(8,))
     count = detect_files(detector, find_inputs(detector, [root]), out)
     assert (count["frames"], count["repeated"]) == (8, 4)
+    assert (
+        detector.saved.usual_input
+        == json.loads((folder / "run.json").read_text())["input"]
+    )
+    assert "in the training: detections" not in caplog.text
     one = config.replace(data={"num_frames": 1})
     with pytest.raises(UserError, match=r"run do not fit config.model .*stem/doppler"):
         experiment.run(one, tmp_path / "one", init_from=folder, mesh=one_device)

@@ -10,6 +10,7 @@ import pathlib
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 from tabulate import tabulate
 from tqdm import tqdm
 
@@ -20,8 +21,15 @@ from radejax.data.dataset import Summary
 from radejax.data.kradar.conditions import KRADAR_CONDITIONS, UNKNOWN_CONDITIONS
 from radejax.data.kradar.dataset import Frame, KRadar
 from radejax.data.kradar.folders import SequenceFolder, read_calibration
+from radejax.data.kradar.labels import MEDIAN_SIZES_M
 from radejax.data.kradar.tesseract import check_frame
+from radejax.geometry.boxes import MIN_OBJECTS, find_size_problem
 from radejax.geometry.radar_grid import RadarGrid
+
+MIN_SEEN = 0.5
+"""Smallest plausible fraction of the objects of a sequence that are in view, of those that are
+visible to the radar. In K-Radar's labels v2.1, it is 0.95; in v2.0, which do not contain the
+visibility, it is 0.6."""
 
 Rows = list[JsonObject]
 
@@ -48,7 +56,7 @@ class HealthReport:
 
     @property
     def num_problems(self) -> int:
-        """Number of missing or malformed items."""
+        """Number of missing, malformed or implausible items."""
         return len(self.summary.problems)
 
     def to_dict(self) -> JsonObject:
@@ -143,6 +151,7 @@ def check_dataset(
     for number, folder in folders.items():
         own = frames.get(number, [])
         _check_calibration(folder, own, summary)
+        _check_objects(number, own, data)
         if is_kradar:
             _check_conditions(number, own, summary)
         row = _row(number, folder, own, splits)
@@ -230,6 +239,30 @@ def _count_objects(frames: Iterable[Frame], splits: Mapping[str, str]) -> Rows:
         | {cls: counts[split, weather][cls] for cls in CLASSES}
         for split, weather in sorted(counts)
     ]
+
+
+def _check_objects(number: int, frames: Sequence[Frame], data: KRadar) -> None:
+    """Reports a sequence whose objects seem to have other units than K-Radar's labels."""
+    labels = [x for f in frames for x in f.labels if x.visibility == "R"]
+    if len(labels) < MIN_OBJECTS:
+        return
+    problems = {}
+    num_seen = sum(len(frame.boxes) for frame in frames)
+    if num_seen < MIN_SEEN * len(labels):
+        range_m, azimuth = data.grid.fov_range_m, np.rad2deg(data.grid.fov_azimuth_rad)
+        problems["objects out of view"] = (
+            f"{len(labels) - num_seen} of {len(labels)} objects that are visible to the "
+            f"radar are not in its view of {range_m:g} m and {azimuth:.3g} deg"
+        )
+    boxes = np.array([label.box for label in labels])
+    # In K-Radar, the largest yaw of a sequence in degrees is below 2 or above 5.
+    if 3 <= np.rad2deg(np.abs(boxes[:, 6])).max() <= 3.15:
+        problems["yaw unit"] = "all yaws are up to pi, as in radians, expected degrees"
+    usual_m = np.array([MEDIAN_SIZES_M[label.cls] for label in labels])
+    if problem := find_size_problem(boxes[:, 3:6], usual_m):
+        problems["object sizes"] = f"objects have {problem} in K-Radar (median)"
+    for kind, text in problems.items():
+        data.summary().report(kind, f"sequence {number}: {text}")
 
 
 def _check_conditions(number: int, frames: Sequence[Frame], summary: Summary) -> None:

@@ -413,6 +413,7 @@ def _read_label_files(
         files[key] = file
         lines += file.problems
         summary.problems += [("label line", text) for text in file.problems]
+        summary.problems += file.doubts
         expected = f"{file.header.radar:05d}_{file.header.lidar:05d}"
         counts["objects in the label files"] += len(file.labels)
         counts["disabled objects (no leading *)"] += file.num_unstarred

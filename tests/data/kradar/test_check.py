@@ -1,5 +1,6 @@
 import errno
 import json
+import math
 import shutil
 
 import numpy as np
@@ -10,6 +11,9 @@ from radejax.core.structures import CLASSES
 from radejax.data.dataset import Summary
 from radejax.data.kradar import KRadar, check, write
 from radejax.data.kradar.check import HealthReport, check_dataset
+from radejax.data.kradar.labels import Label
+
+SEDAN = "expected about 4.61 x 2.18 x 1.91 m"
 
 
 @pytest.fixture
@@ -111,6 +115,46 @@ def test_a_sequence_that_lacks_what_others_have_is_listed(root, folder, message)
     assert f"problem: sequences: 1\n    {message}\n" in report.to_text()
     counted = KRadar(root).counts["sequences without labels"]
     assert counted == (folder == "info_label")
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda x, *box: (-x, *box), "objects out of view"),
+        (lambda x, y, *box: (1e-3 * x, 1e-3 * y, *box), "objects out of view"),
+        (lambda *box: (*box[:6], math.radians(box[6])), "yaw unit"),
+        (lambda *box: (*box[:3], *(0.5 * v for v in box[3:6]), box[6]), "object sizes"),
+        (lambda *box: (*box[:3], *(2 * v for v in box[3:6]), box[6]), "object sizes"),
+        (lambda *box: (*box[:3], box[4], box[3], *box[5:]), "object sizes"),
+    ],
+)
+def test_labels_in_other_units_are_reported_by_sequence(root, change, expected):
+    boxes = [(20.0, y, 0.0, 4.5, 2.0, 1.8, yaw) for y, yaw in ((-3, 0), (3, 3.12))]
+
+    def kinds(change):
+        for path in root.glob("*/info_label/*.txt"):
+            radar, lidar = map(int, path.stem.split("_"))
+            labels = [Label("Sedan", tuple(change(*box))) for box in boxes]
+            write.write_labels(path, (radar, lidar, 1, 1, 1), 1.0, labels)
+        return check_dataset(root).summary.problem_counts()
+
+    assert kinds(lambda *box: box) == {}
+    assert kinds(change)[expected] == 2
+
+
+def test_objects_that_cannot_be_meant_are_named_by_line(root):
+    path = root / "1/info_label/00004_00001.txt"
+    sizes = [(45, 2, 2), (4.5, 2, 0.1), (4.5, 2, 2), (4.4, 2, 2)]
+    places = [(20, 0, 0), (30, 0, 0), (40, 0, 0), (40, 0.05, 0)]
+    labels = [Label("Sedan", (*a, *b, 0)) for a, b in zip(places, sizes, strict=True)]
+    write.write_labels(path, (4, 1, 1, 1, 1), 1.0, labels)
+    problems = check_dataset(root).summary.problems
+    assert problems == [
+        ("object size", f"{path}:2: Sedan of 45 x 2 x 2 m, {SEDAN}"),
+        ("object size", f"{path}:3: Sedan of 4.5 x 2 x 0.1 m, {SEDAN}"),
+        ("object twice", f"{path}:5: Sedan at the center of another object"),
+    ]
+    assert len(KRadar(root)[0].labels) == 4
 
 
 def test_values_are_read_only_if_asked(root):

@@ -199,7 +199,7 @@ def test_published_counts_of_the_training_split(shared):
         assert [int((classes[region] == cls).sum()) for cls in CLASSES] == counts
     assert sum(len(frame.boxes) > 0 for frame in data) == 14593
     assert data.counts["sequences with the default calibration"] == 58
-    assert not data.summary().problems
+    assert data.summary().problem_counts() == {"object size": 3, "object twice": 11}
 
 
 @pytest.mark.slow
@@ -207,6 +207,7 @@ def test_all_real_label_files_are_read(shared):
     everything = {"visibility": None, "classes": LABEL_CLASSES, "field_of_view": False}
     data = KRadar(labels=shared / "data/kradar/labels_v2_1.zip", **everything)
     assert len(data) == 34994
+    assert data.summary().problem_counts() == {"object size": 25, "object twice": 26}
     assert data.counts["frames without objects"] == 4307
     assert data.counts["objects with an odd availability flag"] == 3
     assert data.counts["files named unlike their header"] == 0
