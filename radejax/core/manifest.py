@@ -85,10 +85,11 @@ def warn_of_changes(
     if changed:
         text = (
             "%s: %d of %d files were made from other files than there are now (name, size or "
-            "time differ), such as %s: delete these, or the folder, and repeat the command"
+            "time differ), such as %s: delete these, or the folder, and make them again"
         )
         place = files.relative(folder)
-        _log.warning(text, place, len(changed), len(sources), changed[0])
+        some = ", ".join(changed[:5])
+        _log.warning(text, place, len(changed), len(sources), some)
     return changed
 
 

@@ -58,7 +58,7 @@ def test_files_of_which_the_source_has_changed_are_counted(tmp_path, caplog):
     assert warn_of_changes(tmp_path, paths) == ["b", "c", "d"]
     (message,) = caplog.messages
     assert f"{tmp_path}: 3 of 6 files were made from other files than" in message
-    assert "such as b: delete these, or the folder, and repeat" in message
+    assert "such as b, c, d: delete these, or the folder, and make" in message
 
 
 def test_a_folder_in_which_nothing_was_written_may_get_other_options(tmp_path):
