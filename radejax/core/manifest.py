@@ -23,7 +23,7 @@ import os
 import pathlib
 import time
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import radejax
 from radejax.core import files
@@ -88,8 +88,7 @@ def warn_of_changes(
             "time differ), such as %s: delete these, or the folder, and make them again"
         )
         place = files.relative(folder)
-        some = ", ".join(changed[:5])
-        _log.warning(text, place, len(changed), len(sources), some)
+        _log.warning(text, place, len(changed), len(sources), ", ".join(changed[:5]))
     return changed
 
 
@@ -158,8 +157,7 @@ class Manifest:
             "options": options,
             "names": list(names),
         }
-        is_there = patterns and folder.is_dir()
-        written = files.find_files(folder, *patterns) if is_there else []
+        written = files.find_files(folder, *patterns) if folder.is_dir() else []
         if written and not (folder / FILE).exists():
             raise UserError(
                 f"{files.relative(written[0])} is there, but no {FILE} that describes how "
@@ -174,11 +172,6 @@ class Manifest:
                 raise
             files.write_json(folder / FILE, wanted)
         return cls(folder, options, tuple(names))
-
-    @contextlib.contextmanager
-    def log(self) -> Iterator[Callable[[str, State], None]]:
-        """Yields a function `add(name, sources)` to call for every file that is written."""
-        yield functools.partial(add, self.folder)
 
     def is_done(self, name: str) -> bool:
         """Returns whether a file was written and is there."""

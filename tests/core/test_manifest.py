@@ -26,9 +26,9 @@ def test_what_several_calls_log_is_read_by_the_next_one(tmp_path):
     assert [entry[:2] for entry in state] == [["radar.npy", 4]]
     job = tmp_path / "out"
     for name in ("a.json", "b.json"):
-        with Manifest.claim(job, "boxes", {}, ["a.json", "b.json"]).log() as add:
-            add(name, state)
-            (job / name).write_text("[]")
+        Manifest.claim(job, "boxes", {}, ["a.json", "b.json"])
+        add(job, name, state)
+        (job / name).write_text("[]")
     found = Manifest.open(job)
     assert found.sources == {"a.json": state, "b.json": state}
     assert found.is_done("a.json")
@@ -111,10 +111,9 @@ def test_another_job_in_the_folder_is_an_error(tmp_path, options, names, message
     ],
 )
 def test_missing_and_foreign_files_are_distinguished(tmp_path, logged, there, message):
-    manifest = Manifest.claim(tmp_path, "boxes", {}, ["a.json", "b.json"])
-    with manifest.log() as add:
-        for name in logged:
-            add(f"{name}.json", [])
+    Manifest.claim(tmp_path, "boxes", {}, ["a.json", "b.json"])
+    for name in logged:
+        add(tmp_path, f"{name}.json", [])
     for name in there:
         (tmp_path / f"{name}.json").write_text("[]")
     with pytest.raises(DataError, match=f"{message}.*; fix it"):
