@@ -69,8 +69,9 @@ def detect(
     .pth file. A folder is a K-Radar root, a folder with tesseract_*.mat or projection
     files, or such a file itself. No labels are needed; a radar-camera model finds a
     frame's image by its label file, and uses the radar only without. What is
-    written is scored by `radejax score OUT --data ROOT`. Frames with a box that is not
-    finite are listed, with exit code 1.
+    written is scored by `radejax score OUT --data ROOT`. Frames whose files cannot be
+    read, or with a box that is not finite, are listed, with exit code 1. The same command
+    continues an interrupted one.
 
     Example: radejax detect --workdir runs/quickstart --out boxes data/kradar/5
     """
@@ -86,6 +87,8 @@ def detect(
         detector, inputs, out, batch_size=batch_size, file_format=file_format
     )
     text = f"{count['boxes']} boxes in {count['frames']} frames written to {out}"
+    if count["done"]:
+        text += f"; {count['done']} frames were done before"
     if count["clipped"]:
         text += f"; {count['clipped']} with a size that was clipped to be positive"
     if count["truncated"]:

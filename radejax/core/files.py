@@ -64,11 +64,12 @@ def atomic_write(path: PathLike) -> Iterator[IO[bytes]]:
 
 
 @contextlib.contextmanager
-def swapped_in(folder: PathLike) -> Iterator[pathlib.Path]:
+def swapped_in(folder: PathLike, *stale: str) -> Iterator[pathlib.Path]:
     """Yields a temporary folder whose content moves into `folder` after the block.
 
-    Entries of the same name are replaced, and others stay. If the block raises an error,
-    `folder` remains unchanged.
+    Entries of the same name are replaced, and others stay, except those that match the
+    patterns `stale`: what an earlier block wrote, and this one perhaps not. If the block
+    raises an error, `folder` remains unchanged.
 
     Raises:
         DiskFullError: No space is left on the disk.
@@ -81,9 +82,11 @@ def swapped_in(folder: PathLike) -> Iterator[pathlib.Path]:
             temporary.mkdir()
             yield temporary
             folder.mkdir(exist_ok=True)
-            for path in sorted(temporary.iterdir()):
-                if (folder / path.name).is_dir():
-                    (folder / path.name).rename(temporary / f".old {path.name}")
+            new = sorted(temporary.iterdir())
+            old = {folder / path.name for path in new if (folder / path.name).is_dir()}
+            for path in old.union(*map(folder.glob, stale)):
+                path.rename(temporary / f".old {path.name}")
+            for path in new:
                 path.replace(folder / path.name)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)

@@ -6,7 +6,7 @@ manifest.json          what the folder contains, the options and the names of al
                        the finished job has
 manifest.<id>.jsonl    one line per written file: the time, its name (of records, the key
                        of the frame), and name, size and modification time of each file
-                       that it was made from
+                       that it was made from, or null if it could not be made
 
 Every process appends to a file of its own, so that several processes and hosts can work in
 one folder. A line that a killed process left incomplete is ignored.
@@ -51,14 +51,14 @@ def state_of(paths: Iterable[PathLike | None]) -> State:
     return found
 
 
-def add(folder: pathlib.Path, name: str, sources: State) -> None:
-    """Logs a file that is to be written into a folder next, and the state of its sources."""
+def add(folder: pathlib.Path, name: str, sources: State | None) -> None:
+    """Logs a file of a folder, and the state of its sources; None if it cannot be made."""
     path = folder / f"manifest.{_PROCESS}{os.getpid()}.jsonl"
     with files.disk_full(path), open(path, "a") as file:
         file.write(json.dumps([time.time_ns(), name, sources]) + "\n")
 
 
-def read_sources(folder: pathlib.Path) -> dict[str, State]:
+def read_sources(folder: pathlib.Path) -> dict[str, State | None]:
     """Returns the state of the sources of every logged file, by its name."""
     lines = []
     for path in folder.glob("manifest.*.jsonl"):
@@ -108,8 +108,8 @@ class Manifest:
     names: tuple[str, ...]
 
     @functools.cached_property
-    def sources(self) -> Mapping[str, State]:
-        """State of the sources of every written file, by its name."""
+    def sources(self) -> Mapping[str, State | None]:
+        """State of the sources of every file, by its name; None if it cannot be made."""
         return read_sources(self.folder)
 
     @classmethod
@@ -173,23 +173,28 @@ class Manifest:
             files.write_json(folder / FILE, wanted)
         return cls(folder, options, tuple(names))
 
-    def is_done(self, name: str) -> bool:
-        """Returns whether a file was written and is there."""
-        return name in self.sources and (self.folder / name).is_file()
+    def is_done(self, name: str, sources: State) -> bool:
+        """Returns whether a file was made from the given sources and is there."""
+        return self.sources.get(name) == sources and (self.folder / name).is_file()
 
-    def check_whole(self, pattern: str, fix: str) -> None:
+    def check_whole(self, pattern: str, fix: str) -> set[str]:
         """Checks that exactly the files of the finished job are there.
 
         Args:
             pattern: Pattern of the names of the job's files, such as "*.json".
             fix: Advice at the end of the error message.
 
+        Returns:
+            The names of the files that could not be made. They may be missing.
+
         Raises:
             DataError: Files are missing, as the job was interrupted or the folder was
                 copied in part, or there are files that are not of this job.
         """
         total = len(self.names)
-        missing = [name for name in self.names if not (self.folder / name).is_file()]
+        failed = {name for name in self.names if self.sources.get(name, ()) is None}
+        made = [name for name in self.names if name not in failed]
+        missing = [name for name in made if not (self.folder / name).is_file()]
         there = {str(p.relative_to(self.folder)) for p in self.folder.glob(pattern)}
         problems = {
             f"an interrupted job, which did not write {{}} of {total} files": [
@@ -207,3 +212,4 @@ class Manifest:
                 found = problem.format(len(names))
                 place = files.relative(self.folder)
                 raise DataError(f"{place} holds {found}, such as {names[0]}; {fix}")
+        return failed

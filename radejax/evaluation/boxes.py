@@ -344,6 +344,19 @@ def frame_keys(frames: AnyColumns) -> list[str]:
     return [name if "/" in name else f"{number}/{name}" for number, name in pairs]
 
 
+def ids_by_name(frames: AnyColumns) -> dict[str, int]:
+    """Returns the id of every frame by its key and by "sequence/radar", see `frame_key`.
+
+    Examples:
+        >>> ids_by_name({"frame": [7], "name": ["5/00012_00001"]})
+        {'5/00012_00001': 7, '5/00012': 7}
+    """
+    ids = np.asarray(frames["frame"]).tolist()
+    by_key = dict(zip(map(frame_key, frame_keys(frames)), ids, strict=True))
+    by_radar = {key.rpartition("_")[0]: i for key, i in by_key.items()}
+    return by_key | by_radar | by_key  # keys come first and take precedence
+
+
 def with_ids(
     table: Columns, frames: AnyColumns | None, where: str, *, skip: bool = False
 ) -> Columns:
@@ -369,12 +382,7 @@ def with_ids(
     if named.dtype.kind in "iu" or not named.size:
         return {**table, "frame": named.astype(np.int64)}
     names = [frame_key(str(name)) for name in named]
-    known: dict[str, int] = {}
-    if frames is not None:
-        ids = np.asarray(frames["frame"]).tolist()
-        by_key = dict(zip(map(frame_key, frame_keys(frames)), ids, strict=True))
-        by_radar = {key.rpartition("_")[0]: i for key, i in by_key.items()}
-        known = by_key | by_radar | by_key  # keys come first and take precedence
+    known = {} if frames is None else ids_by_name(frames)
     is_known = np.array([name in known for name in names])
     if skip and is_known.any():
         table = take(table, is_known)

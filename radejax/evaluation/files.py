@@ -14,15 +14,16 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from radejax.core import files
-from radejax.core.archives import read_npz
+from radejax.core.archives import read_npz, wrap_read_errors
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import JsonObject, PathLike
+from radejax.core.manifest import FILE, Manifest
 from radejax.core.options import Options, as_tuples
-from radejax.core.structures import BOX_FIELDS, Boxes
+from radejax.core.structures import BOX_FIELDS, Boxes, frame_key
 from radejax.data.kradar import KRadar
 from radejax.evaluation import boxes
 from radejax.evaluation.boxes import Columns, column_names, columns_of_boxes
-from radejax.evaluation.kitti import read_kitti
+from radejax.evaluation.kitti import find_root, read_kitti
 from radejax.evaluation.report import Report, write_report
 from radejax.evaluation.results import ReportOptions
 
@@ -50,20 +51,48 @@ def read_table(
         FileNotFoundError: There is no such file.
         UserError: The kind of file is unknown.
         DataError: A column is missing, a value is not a number, or a frame is unknown;
-            the message names the file and the row.
+            the message names the file and the row. Or a folder of `radejax detect` is not
+            complete.
+    """
+    return _read(path, frames, scored)[0]
+
+
+def _read(
+    path: PathLike, frames: Columns | None, scored: bool
+) -> tuple[Boxes, dict[int | str, bool] | None]:
+    """Reads a table, and for a folder which frames have a file.
+
+    These are frame ids or keys, with False for those in which `radejax detect` failed.
     """
     path = files.as_path(path)
+    there: dict[int | str, bool] | None = None
     columns: Columns
+    if manifest := Manifest.open(path):
+        pattern = "preds/*.txt" if _is_kitti(path) else "*.json"
+        failed = manifest.check_whole(pattern, "run `radejax detect` or copy again")
+        pairs = zip(manifest.options.get("frames", ()), manifest.names, strict=False)
+        there = {key: name not in failed for key, name in pairs}
     if _is_kitti(path):
         columns = columns_of_boxes(read_kitti(path)[scored])
+        texts = (find_root(path) / "preds").glob("*.txt")
+        keys = np.array([int(text.stem) for text in texts], int)
         if frames is not None and (path / "frames.json").is_file():
             # The frame table that `radejax detect` writes maps file numbers to frames.
             names = _read_frames(path / "frames.json")["name"]
+            with wrap_read_errors(
+                path / "frames.json", "the names of all files in preds"
+            ):
+                keys = names[keys]
             columns = {**columns, "frame": names[columns["frame"]]}
-    elif path.is_dir() or path.suffix == ".json":
-        parts = sorted(path.glob("*.json")) if path.is_dir() else [path]
+        there = there or dict.fromkeys(keys.tolist(), True)
+    elif path.is_dir():
+        parts = sorted({*path.glob("*.json")} - {path / FILE})
         rows = [row for part in parts for row in _records(part, scored)]
         columns = boxes.columns_of(rows)
+        stems = [part.stem.replace("_", "/", 1) for part in parts]
+        there = there or dict.fromkeys(stems, True)
+    elif path.suffix == ".json":
+        columns = boxes.columns_of([*_records(path, scored)])
     elif path.suffix == ".npz":
         columns = read_npz(path)
         if missing := [x for x in column_names(scored) if x not in columns]:
@@ -75,7 +104,7 @@ def read_table(
         )
     columns = {name: columns[name] for name in column_names(scored)}
     table = boxes.with_ids(columns, frames, str(path), skip=path.is_dir())
-    return boxes.read_boxes(table, str(path), scored=scored)
+    return boxes.read_boxes(table, str(path), scored=scored), there
 
 
 def _is_kitti(path: pathlib.Path) -> bool:
@@ -167,14 +196,14 @@ def load(
     """
     path = files.as_path(path)
     if (path / "predictions.npz").is_file():
-        source = source.replace(ground_truth=str(path))
+        source = source.replace(ground_truth=str(path / "ground_truth.npz"))
         path = path / "predictions.npz"
     known = {*boxes.KNOWN_CLASSES, *stored_options(path).get("classes", ())}
     truth, given, left_out = _load_ground_truth(path, source, classes)
     known |= set(truth.cls.tolist())
     expected = f"some of {', '.join(sorted(known))}"
     require(known.issuperset(classes), "classes", classes, expected)
-    found = read_table(path, given)
+    found, there = _read(path, given, scored=True)
     frames = given or {"frame": np.union1d(truth.frame, found.frame)}
     box = found.box.copy()
     box[:, 2] += source.z_offset_m
@@ -198,6 +227,24 @@ def load(
         frames = boxes.take(frames, is_chosen)
         truth = truth.take(np.isin(truth.frame, frames["frame"]))
         found = found.take(np.isin(found.frame, frames["frame"]))
+    if there is not None:
+        # K-Radar's tools write files only for frames with ground truth.
+        needed = truth.frame if _is_kitti(path) else frames["frame"]
+        ids = boxes.ids_by_name(frames)
+        is_made = {ids.get(frame_key(str(x)), x): y for x, y in there.items()}
+        is_made |= dict.fromkeys(found.frame.tolist(), True)
+        lost = [x for x in np.unique(needed).tolist() if x not in is_made]
+        if lost:
+            first = boxes.frame_keys(boxes.take(frames, frames["frame"] == lost[0]))[0]
+            raise DataError(
+                f"{path}: {len(lost)} of {len(frames['frame'])} frames have no file, such as "
+                f"{first} (a frame without boxes has an empty one): add them, or choose "
+                "other frames by --sequences, --weather or --split"
+            )
+        failed = [x for x in frames["frame"].tolist() if not is_made.get(x, True)]
+        left_out = {**left_out, "frames left out: `radejax detect` failed": len(failed)}
+        frames = boxes.take(frames, ~np.isin(frames["frame"], failed))
+        truth = truth.take(np.isin(truth.frame, frames["frame"]))
     return truth, found, frames, left_out
 
 
@@ -254,7 +301,7 @@ def stored_options(path: PathLike) -> JsonObject:
     for config in (place.parent / "config.json", place / "config.json"):
         if config.is_file():
             found = {"classes": files.read_object(config, "classes")["classes"]}
-    if (place / "metrics.json").is_file():
+    if any((place / name).is_file() for name in ("metrics.json", "predictions.npz")):
         found = files.read_object(place / "metrics.json", "options")["options"]
     return {name: as_tuples(value) for name, value in found.items()}
 

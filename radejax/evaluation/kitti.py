@@ -159,14 +159,15 @@ def read_kitti(folder: PathLike) -> tuple[Boxes, Boxes, Columns]:
         UserError: The folder `preds` is missing, or there are several score thresholds.
         DataError: A line is malformed; the message names the file and the line.
     """
-    root = _find_root(files.as_path(folder))
+    root = find_root(files.as_path(folder))
     numbers, found = _read_folder(root / "preds", scored=True)
     others, truth = _read_folder(root / "gts", scored=False)
     frames = _frame_table(sorted({*numbers, *others}), root / "desc")
     return truth, found, frames
 
 
-def _find_root(folder: pathlib.Path) -> pathlib.Path:
+def find_root(folder: pathlib.Path) -> pathlib.Path:
+    """Returns the folder with `preds` that `read_kitti` reads; see there for errors."""
     for pattern in ("preds", "all/preds", "*/all/preds"):
         found = sorted(folder.glob(pattern))
         if len(found) > 1:

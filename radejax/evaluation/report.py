@@ -30,6 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from tabulate import LATEX_ESCAPE_RULES, tabulate
 
+import radejax
 from radejax.core import files
 from radejax.core.files import JsonObject, PathLike
 from radejax.data.kradar.conditions import WEATHERS
@@ -45,6 +46,9 @@ from radejax.evaluation.results import (
     make_set,
     to_row,
 )
+
+STALE = ("kitti", "precision_recall_*")
+"""Patterns of the names of what only some reports contain."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,7 +86,8 @@ def write_report(
         predictions: The same with scores.
         frames: Frame table with the column frame `[F]` (ids) and, as far as known, name,
             sequence, weather, environment, time, simulated and split.
-        out_dir: Folder of the report. Files in it are replaced when all are written.
+        out_dir: Folder of the report. An earlier report in it is replaced when all files
+            are written.
         options: Settings of the evaluation.
         run: Name of the run in tables.
         left_out: Counts of what was read and skipped when loading, by reason.
@@ -107,6 +112,7 @@ def write_report(
     splits = np.unique(np.asarray(frames.get("split", [])).astype(str))
     metrics: JsonObject = {
         "run": run,
+        "radejax": radejax.__version__,
         "options": options.to_dict(),
         "split": splits.item() if splits.size == 1 else None,
         "is_simulated": data.is_simulated,
@@ -128,7 +134,7 @@ def write_report(
     tables = RunTables(run, by_key, options, metrics["split"])
     text = _console_text(metrics, tables)
     built = _all_tables(metrics, tables)
-    with files.swapped_in(out_dir) as folder:
+    with files.swapped_in(out_dir, *STALE) as folder:
         # The inputs are stored with the report, so that reports can be compared later.
         columns = {name: np.asarray(column).tolist() for name, column in frames.items()}
         files.write_json(folder / "metrics.json", metrics)

@@ -10,16 +10,19 @@ import csv
 import dataclasses
 import itertools
 import pathlib
-from collections.abc import Callable, Sequence
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import jax
 import numpy as np
+from jaxtyping import Int
 
 from radejax import models
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike
-from radejax.core.structures import Boxes
+from radejax.core.manifest import Manifest, State, add, state_of
+from radejax.core.structures import Array, Boxes, Detections
 from radejax.data.cameras import camera_inputs, require_images
 from radejax.data.dataset import FrameSequence, find_reader
 from radejax.data.kradar import KRadar
@@ -29,13 +32,16 @@ from radejax.data.pipeline import frame_histories
 from radejax.evaluation import kitti
 from radejax.geometry.camera import Camera
 from radejax.inference.detector import Detector, Item
-from radejax.inference.inputs import Frames
-from radejax.inference.predict import detect_batches
+from radejax.inference.inputs import InputReader
+from radejax.inference.predict import Batches, detect_batches
+from radejax.weights.image_backbone import weights_sha256
 
 View = tuple[pathlib.Path | None, Camera | None]
 """Front image and camera of a frame."""
 
 NO_VIEW: View = (None, None)
+
+_Inputs = tuple[Array, Array | None, Camera | None]
 
 
 def front_images(
@@ -120,36 +126,43 @@ class FrameInputs:
     Attributes:
         keys: Key of every frame, by which its boxes are written. The frames of a sequence
             follow each other in their order.
-        read: Function that returns the radar data of a range of the frames.
-        views: Front image and camera of every frame; empty if no frame has them.
+        paths: Radar file of every frame; None if it is not known.
+        radar: Function that returns the radar data of a frame, or their file, by position.
+        views: Front image and camera of every frame.
     """
 
     keys: list[str]
-    read: Callable[[slice], Frames]
-    views: list[View]
+    paths: Sequence[pathlib.Path | None]
+    radar: Callable[[int], Array | PathLike]
+    views: Sequence[View]
 
-    def batches(self, num_frames: int, batch_size: int) -> list[list[range]]:
-        """Return the batches of every part of consecutive frames, as positions.
+    def parts(self, num_frames: int) -> list[range]:
+        """Return the positions of every part of consecutive frames.
 
-        All frames are one part if a sample has one frame.
+        Every frame is a part if a sample has one frame.
         """
-        starts = [0]
-        if num_frames > 1:
-            sample_of = frame_histories(self.keys, 2)
-            pairs = itertools.pairwise(self.keys)
-            starts += [i for i, (a, b) in enumerate(pairs, 1) if sample_of[b][0] != a]
-        return [
-            [range(i, min(i + batch_size, end)) for i in range(start, end, batch_size)]
-            for start, end in itertools.pairwise([*starts, len(self.keys)])
-        ]
+        before = frame_histories(self.keys, 2) if num_frames > 1 else {}
+        starts = [i for i, x in enumerate(self.keys) if before.get(x, [x])[0] == x]
+        return [range(*ends) for ends in itertools.pairwise([*starts, len(self.keys)])]
 
-    def item(self, batch: range) -> Item:
-        """Read the frames of a batch as an item of `Detector.stream`."""
-        rows = slice(batch.start, batch.stop)
-        if not self.views:
-            return self.read(rows)
-        images, cameras = zip(*self.views[rows], strict=True)
-        return self.read(rows), images, cameras
+    def read(self, index: int, reader: InputReader) -> _Inputs:
+        """Read the radar data and the image of a frame, and return its camera too.
+
+        Raises:
+            DataError: A file is corrupted.
+            OSError: A file cannot be read.
+        """
+        path, camera = self.views[index]
+        image = None
+        if path is not None:
+            image = np.asarray(reader.read_cameras([path], [camera], 1)[0])[0]
+        return reader.read_radar([self.radar(index)])[0], image, camera
+
+    def state(self, index: int) -> State:
+        """Return the state of the files of a frame, and a checksum of its camera."""
+        image, camera = self.views[index]
+        checksum = zlib.crc32(repr(camera).encode())
+        return [*state_of([self.paths[index], image]), ["camera", checksum]]
 
 
 def find_inputs(
@@ -199,10 +212,12 @@ def find_inputs(
     if detector.grid != frames.grid:
         raise UserError(f"{paths[0]}: the radar has other axes than that of the run")
 
-    def read(rows: slice) -> np.ndarray:
-        return np.stack([f.read_projection(frames.grid) for f in frames[rows]])
-
-    return FrameInputs([f.key for f in frames], read, _views(frames, detector))
+    return FrameInputs(
+        [frame.key for frame in frames],
+        [frame.radar_path for frame in frames],
+        lambda index: frames[index].read_projection(frames.grid),
+        _views(frames, detector) or [NO_VIEW] * len(frames),
+    )
 
 
 def _of_files(
@@ -225,8 +240,9 @@ def _of_files(
     known: dict[pathlib.Path, View] = {}
     if detector.takes_camera:
         known = front_images(found, detector, labels, camera_calibration, roots)
-    views = [known.get(path.absolute(), NO_VIEW) for path in found if known]
-    return FrameInputs([key_of(path) for path in found], found.__getitem__, views)
+    views = [known.get(path.absolute(), NO_VIEW) for path in found]
+    keys = [key_of(path) for path in found]
+    return FrameInputs(keys, found, found.__getitem__, views)
 
 
 def detect_files(
@@ -239,79 +255,157 @@ def detect_files(
 ) -> tuple[dict[str, int], dict[str, str]]:
     """Detect the objects in every frame, and write one file per frame atomically.
 
-    A frame with a box that is not finite fails, and a file of an earlier detection in it is
-    removed.
+    A second call with the same model, settings and frames continues an interrupted one: it
+    detects in the frames without a file and in those whose radar file or image changed, or
+    in whole parts of consecutive frames for a model of several frames. A frame with a file
+    that cannot be read, or with a box that is not finite, fails and has no file.
 
     Args:
         detector: Detector, whose default thresholds and region are used.
         inputs: Frames that `find_inputs` found.
         out: Folder of the files `<sequence>_<radar>.json`. Each contains a list of {frame,
             cls, score, x, y, z, l, w, h, yaw}, in meters and radians in the radar frame;
-            the value of "frame" is "<sequence>/<radar>".
+            the value of "frame" is "<sequence>/<radar>". `core.manifest` describes them.
         batch_size: Number of frames per call of the detector.
         file_format: "json", or "kitti" for files `preds/000000.txt` in the format of
             K-Radar's tools, and `frames.json` with the frames that these numbers stand for.
             "csv" writes one table `boxes.csv` of all boxes at the end, in the columns of
-            the records.
+            the records; a second call begins again.
 
     Returns:
-        The numbers of "frames" that did not fail, of "boxes", of "clipped" boxes, whose size
-        was clipped, and of "truncated" ones, which are not written because of
-        `max_detections`; and the reasons of failed frames by key.
+        The numbers of "frames" in which objects were detected, of "boxes", of "clipped"
+        boxes, whose size was clipped, of "truncated" ones, which are not written because
+        of `max_detections`, and of frames that were "done" by an earlier call; and the
+        reasons of failed frames by key.
         For a model of several frames, "repeated" is the number of frames that repeat
         themselves, as there is no preceding one. For a radar-camera model, "radar_only" is
         the number of frames without a label file, image or calibration.
 
     Raises:
-        UserError: An image or weight is not as expected.
+        UserError: A weight is not as expected, or the folder has boxes of another model,
+            of other settings or of other frames.
     """
     detector = detector.replace()  # its counters start at zero
     keys = inputs.keys
     out = files.as_path(out)
-    out.mkdir(parents=True, exist_ok=True)
-    names = [f"{key.replace('/', '_')}.json" for key in keys]
-    if file_format == "kitti":
-        names = [f"preds/{frame:06d}.txt" for frame in range(len(keys))]
-        table = {"frame": list(range(len(keys))), "name": keys}
-        files.write_json(out / "frames.json", table)
-    parts = inputs.batches(detector.num_frames, batch_size)
-    batches = (((np.array(rows), inputs.item(rows)) for rows in part) for part in parts)
+    names, manifest = _claim(detector, keys, out, file_format)
+    states = [inputs.state(frame) for frame in range(len(keys))]
+    done = {i for i, x in enumerate(states) if manifest.is_done(names[i], x)}
+    parts = [x for x in inputs.parts(detector.num_frames) if not done.issuperset(x)]
+    todo = [frame for part in parts for frame in part]
+    for frame in todo:
+        (out / names[frame]).unlink(missing_ok=True)
+    queue = [iter(todo)] if detector.num_frames == 1 else [iter(x) for x in parts]
     found = [Boxes.one_frame([], [], [])]
-    failed = dict[str, str]()
+    seen = list[str]()
+    failed = dict[int, str]()
     count = {"frames": 0, "boxes": 0, "clipped": 0, "truncated": 0}
-    results = detect_batches(detector, batches, len(keys), progress=True)
-    for frames, detections in results:
-        on_host = jax.device_get(detections)
-        for row, frame in enumerate(frames.tolist()):
-            key = keys[frame]
-            path = out / names[frame]
-            one = jax.tree.map(lambda x, row=row: x[row : row + 1], on_host)
-            try:
-                boxes = one.to_boxes(frames[row : row + 1])
-            except DataError as error:
-                failed[key] = str(error)
-                if file_format != "csv":
-                    path.unlink(missing_ok=True)
-                continue
-            count["frames"] += 1
-            count["boxes"] += len(boxes)
-            count["truncated"] += boxes.num_truncated
-            count["clipped"] += int(boxes.is_clipped.sum())
-            if file_format == "csv":
-                found.append(boxes)
-            elif file_format == "kitti":
-                (text,) = kitti.prediction_texts(boxes, [frame])
-                files.write_text(path, f"{text}\n")
-            else:
-                rows = [{"frame": key, **box} for box in boxes.to_list()]
-                files.write_json(path, rows)
+    count["done"] = len(keys) - len(todo)
+    batches = (_batches(inputs, detector, x, batch_size, failed, queue) for x in queue)
+    results = detect_batches(detector, batches, len(todo), progress=True)
+    for frame, detections in _single(results):
+        seen.append(keys[frame])
+        try:
+            boxes = detections.to_boxes(np.array([frame]))
+        except DataError as error:
+            failed[frame] = str(error)
+            continue
+        count["frames"] += 1
+        count["boxes"] += len(boxes)
+        count["truncated"] += boxes.num_truncated
+        count["clipped"] += int(boxes.is_clipped.sum())
+        if file_format == "csv":
+            found.append(boxes)
+            continue
+        if file_format == "kitti":
+            (text,) = kitti.prediction_texts(boxes, [frame])
+            files.write_text(out / names[frame], f"{text}\n")
+        else:
+            rows = [{"frame": keys[frame], **box} for box in boxes.to_list()]
+            files.write_json(out / names[frame], rows)
+        add(out, names[frame], states[frame])
+    for frame in failed:
+        add(out, names[frame], None)
     if file_format == "csv":
         _write_csv(out / "boxes.csv", Boxes.concatenate(found), keys)
     if detector.num_frames > 1:
-        count["repeated"] = len(parts)
+        count["repeated"] = len(dataclasses.replace(inputs, keys=seen).parts(2))
     if detector.takes_camera:
         count["radar_only"] = detector.num_radar_only
-    return count, failed
+    return count, {keys[frame]: reason for frame, reason in failed.items()}
+
+
+def _claim(
+    detector: Detector, keys: list[str], out: pathlib.Path, kind: str
+) -> tuple[list[str], Manifest]:
+    """Describe the boxes in their folder, or open that of the same detection.
+
+    Returns:
+        The file of every frame, and the description.
+    """
+    names = [f"{key.replace('/', '_')}.json" for key in keys]
+    if kind == "kitti":
+        names = [f"preds/{frame:06d}.txt" for frame in range(len(keys))]
+    options: files.JsonObject = {
+        "format": kind,
+        "frames": keys,
+        "step": detector.saved.step,
+        "weights": weights_sha256(detector.variables)[:16],
+        "config": detector.saved.config.without_data_paths(),
+    }
+    of_kind = {"json": names, "kitti": [*names, "frames.json"], "csv": []}
+    patterns = [f"*.{suffix}" for suffix in ("json", "txt", "csv")]
+    manifest = Manifest.claim(out, "boxes", options, of_kind[kind], patterns)
+    if kind == "kitti":
+        table = {"frame": list(range(len(keys))), "name": keys}
+        files.write_json(out / "frames.json", table)
+    return names, manifest
+
+
+def _batches(
+    inputs: FrameInputs,
+    detector: Detector,
+    part: Iterator[int],
+    batch_size: int,
+    failed: dict[int, str],
+    queue: list[Iterator[int]],
+) -> Batches:
+    """Read the frames of a part as batches of `detect_batches`.
+
+    Frames that cannot be read go to `failed`. For a model of several frames, the rest of
+    the part goes to the end of `queue` as a part of its own, as its first frame has no
+    preceding one.
+    """
+    is_whole = True
+    while is_whole:
+        items = dict[int, _Inputs]()
+        for frame in part:
+            try:
+                items[frame] = inputs.read(frame, detector.reader)
+            except (DataError, OSError) as error:
+                failed[frame] = str(error)
+                if detector.num_frames > 1:
+                    queue.append(part)
+                    break
+            if len(items) == batch_size:
+                break
+        is_whole = len(items) == batch_size
+        if items:
+            radar, images, cameras = zip(*items.values(), strict=True)
+            item: Item = [*radar]
+            if any(image is not None for image in images):
+                item = [*radar], images, cameras
+            yield np.array([*items]), item
+
+
+def _single(
+    results: Iterable[tuple[Int[np.ndarray, " B"], Detections]],
+) -> Iterator[tuple[int, Detections]]:
+    """Yield index and detections of every frame on the host."""
+    for frames, detections in results:
+        on_host = jax.device_get(detections)
+        for row, frame in enumerate(frames.tolist()):
+            yield frame, jax.tree.map(lambda x, row=row: x[row : row + 1], on_host)
 
 
 def _write_csv(path: pathlib.Path, boxes: Boxes, keys: Sequence[str]) -> None:

@@ -134,7 +134,7 @@ class Detector:
         self.num_frames = self.model.num_frames
         self.takes_camera = models.has_camera(self.model)
         self.camera_options = config.data.used_camera
-        self._reader = InputReader(self.model, self.grid, config.data)
+        self.reader = InputReader(self.model, self.grid, config.data)
         self.classes = config.classes
         self.decode_options = config.decode
         self.sharding = sharding or SingleDeviceSharding(jax.devices()[0])
@@ -279,7 +279,7 @@ class Detector:
                 radar = self._stacked(radar)
             else:
                 is_checked = not isinstance(radar, np.ndarray)
-            images, cameras, missing = self._reader.read_cameras(
+            images, cameras, missing = self.reader.read_cameras(
                 image, camera, len(radar)
             )
             inputs = Inputs(radar, images, cameras)
@@ -298,7 +298,7 @@ class Detector:
 
     def _read_radar(self, frames: Frames, num_frames: int = 1) -> Real[Any, "B ..."]:
         """Read radar data, and compare a frame of the first calls with the training's."""
-        radar = self._reader.read_radar(frames, num_frames)
+        radar = self.reader.read_radar(frames, num_frames)
         # Those of `warmup` are all 0.
         if self._num_unchecked and isinstance(radar, np.ndarray) and radar.any():
             frame = jnp.asarray(radar[0])

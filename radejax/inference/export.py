@@ -34,7 +34,7 @@ from radejax.geometry.camera import Camera
 from radejax.inference import exported_loader
 from radejax.inference.detector import Detector
 from radejax.inference.inputs import Settings
-from radejax.inference.saved import save_model
+from radejax.inference.saved import CONFIG_FILE, WEIGHTS_FILE, save_model
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.options import DinoRadeOptions
 
@@ -90,7 +90,7 @@ def export(
     half: bool = False,
     radar_input: str = "projection",
 ) -> tuple[int, list[str]]:
-    """Write a folder with the model; files of an earlier export are replaced or removed.
+    """Write a folder with the model, which replaces an earlier export.
 
     Args:
         detector: Detector to export. Its thresholds and region of interest become the
@@ -113,8 +113,8 @@ def export(
 
     Raises:
         UserError: The kind or a platform is unknown, jax2onnx is not installed for ONNX,
-            the image transformer is to be kept for ONNX, or `half` is given for a program,
-            which takes float32 weights.
+            the image transformer is to be kept for ONNX, `half` is given for a program,
+            which takes float32 weights, or the folder has other files than an export.
     """
     require(kind in FORMATS, "format", kind, f"one of {FORMATS}")
     is_known = set(platforms) <= set(KNOWN_PLATFORMS)
@@ -123,24 +123,34 @@ def export(
         raise UserError("--half is only supported with --format huggingface")
     shape = _radar_shape(detector, radar_input)
     folder = files.as_path(folder)
+    there = {path.name for path in folder.glob("[!.]*")}
+    foreign = (
+        there - _OF_PROGRAMS - {CONFIG_FILE, WEIGHTS_FILE, "README.md", "__pycache__"}
+    )
+    if CONFIG_FILE in there and "format" not in files.read_object(folder / CONFIG_FILE):
+        foreign.add(CONFIG_FILE)
+    if foreign:
+        raise UserError(
+            f"{files.relative(folder)} holds files that are not of an export, such as "
+            f"{min(foreign)}: choose another folder, or delete them"
+        )
     programs: dict[str, bytes] = {}
     if kind == "stablehlo":
         programs = _stablehlo(detector, shape, platforms, batch_size, with_backbone)
     elif kind == "onnx":
         programs = _onnx_files(detector, shape, batch_size or 1, with_backbone)
-    content = save_model(
-        detector.saved,
-        folder,
-        with_backbone=with_backbone,
-        half=half,
-        programs=programs,
-    )
-    for name in _OF_PROGRAMS - set(programs):
-        (folder / name).unlink(missing_ok=True)
-    if kind == "stablehlo":
-        files.write_text(folder / "load.py", inspect.getsource(exported_loader))
-    left_out = content["left_out"]
-    files.write_text(folder / "README.md", _readme(detector, shape, left_out))
+    with files.swapped_in(folder, *_OF_PROGRAMS) as temporary:
+        content = save_model(
+            detector.saved,
+            temporary,
+            with_backbone=with_backbone,
+            half=half,
+            programs=programs,
+        )
+        if kind == "stablehlo":
+            files.write_text(temporary / "load.py", inspect.getsource(exported_loader))
+        left_out = content["left_out"]
+        files.write_text(temporary / "README.md", _readme(detector, shape, left_out))
     num_bytes = sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
     return num_bytes, left_out
 

@@ -24,7 +24,7 @@ from radejax.data.dataset import FrameSequence, LabelledFrame, find_reader
 from radejax.data.projection import decode
 from radejax.evaluation.boxes import roi_bounds, tables_from_frames
 from radejax.evaluation.evaluation_set import Result
-from radejax.evaluation.report import Report, write_report
+from radejax.evaluation.report import STALE, Report, write_report
 from radejax.evaluation.results import (
     ReportOptions,
     compute_results,
@@ -43,6 +43,8 @@ from radejax.visualize.draw import draw_frame, draw_scenes
 from radejax.visualize.style import Scene, save_figure
 
 _log = logging.getLogger(__name__)
+
+_STALE = ("camera_share.json", "figures", "scenes.*", "training.*")
 
 
 class Evaluation:
@@ -151,7 +153,8 @@ class Evaluation:
         Args:
             variables: Variables of the model.
             workdir: Workdir of the run.
-            out: Folder of the results; `evaluation` in the workdir if None.
+            out: Folder of the results, which replace earlier ones; `evaluation` in the
+                workdir if None.
             step: Step of the variables, which is written to `source.json`.
             run: Name of the run in the report; the workdir's name if None.
 
@@ -162,7 +165,7 @@ class Evaluation:
         place = out or workdir / "evaluation"
 
         def write() -> Report:
-            with files.swapped_in(place) as folder:
+            with files.swapped_in(place, *_STALE, *STALE) as folder:
                 files.write_json(folder / "source.json", {"step": step, **self._source})
                 report = write_report(
                     self._truth,

@@ -31,8 +31,12 @@ def test_what_several_calls_log_is_read_by_the_next_one(tmp_path):
         (job / name).write_text("[]")
     found = Manifest.open(job)
     assert found.sources == {"a.json": state, "b.json": state}
-    assert found.is_done("a.json")
-    found.check_whole("*.json", "fix it")
+    assert found.is_done("a.json", state)
+    assert not found.is_done("a.json", [])
+    assert found.check_whole("*.json", "fix it") == set()
+    add(job, "b.json", None)  # could not be made again
+    (job / "b.json").unlink()
+    assert Manifest.open(job).check_whole("*.json", "fix it") == {"b.json"}
 
 
 def test_the_last_line_of_all_processes_holds_and_an_incomplete_one_is_ignored(

@@ -2,20 +2,30 @@
 
 import csv
 import json
+import os
+import shutil
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
+from PIL import Image
 
 from radejax import models
 from radejax.config import Config
 from radejax.core import files
-from radejax.core.errors import UserError
+from radejax.core.errors import DataError, UserError
+from radejax.core.manifest import add
 from radejax.data.kradar.radar_files import find_frames
 from radejax.data.options import CameraOptions
 from radejax.evaluation.files import Source
 from radejax.evaluation.files import load as load_tables
-from radejax.inference.detect_files import detect_files, find_inputs, front_images
+from radejax.inference.detect_files import (
+    FrameInputs,
+    detect_files,
+    find_inputs,
+    front_images,
+)
 from radejax.inference.detector import Detector
 from radejax.models.options import DinoRadeOptions, ImageOptions
 from radejax.simulation.config import SimulationOptions
@@ -48,7 +58,7 @@ def test_every_format_has_the_same_boxes(tmp_path):
         num_boxes = sum(map(len, expected))
         truncated = int(detector(frames).num_truncated.sum())
         wanted = {"boxes": num_boxes, "clipped": clipped, "truncated": truncated}
-        assert count == {"frames": 3, **wanted}
+        assert count == {"frames": 3, "done": 0, **wanted}
         assert truncated > 0
         assert failed == {}
     rows = [
@@ -56,7 +66,7 @@ def test_every_format_has_the_same_boxes(tmp_path):
         for key, boxes in zip(keys, expected, strict=True)
         for box in boxes
     ]
-    files_of_frames = sorted((tmp_path / "json").iterdir())
+    files_of_frames = sorted((tmp_path / "json").glob("7_*.json"))
     assert [path.name for path in files_of_frames] == [
         f"7_0000{i}.json" for i in range(3)
     ]
@@ -95,6 +105,8 @@ def test_a_frame_with_a_box_that_is_not_finite_fails(
     out = tmp_path / "out"
     assert detect_files(detector, inputs, out, file_format=file_format)[1] == {}
     earlier = sorted(out.rglob("*"))
+    for path in inputs.paths:  # so that they are detected in again
+        os.utime(path, ns=(0, 0))
 
     def stream(self, frames):
         for item in frames:
@@ -115,6 +127,177 @@ def test_a_frame_with_a_box_that_is_not_finite_fails(
         assert found == {"7/00000", "7/00002"}
 
 
+@pytest.fixture(scope="module")
+def detected(tmp_path_factory):
+    """Detector of three frames, and a folder with `data` and the boxes of every format."""
+    folder = tmp_path_factory.mktemp("detected")
+    keys = [f"7/0000{i}" for i in range(3)]
+    _write_projections(folder / "data", keys, small.projections(3))
+    detector = small.detector(batch_sizes=(2,))
+    inputs = find_inputs(detector, [folder / "data"])
+    for kind in ("json", "kitti", "csv"):
+        detect_files(detector, inputs, folder / kind, batch_size=2, file_format=kind)
+    return detector, folder
+
+
+def _texts(folder):
+    paths = [path for path in folder.rglob("*[0-9x].*") if "manifest" not in path.name]
+    return {path.relative_to(folder).as_posix(): path.read_text() for path in paths}
+
+
+@pytest.mark.parametrize(
+    ("kind", "lost", "done"),
+    [
+        ("json", ["7_00001.json"], 2),
+        ("kitti", ["preds/000001.txt"], 2),
+        ("csv", [], 0),
+    ],
+)
+def test_a_file_that_cannot_be_read_fails_alone_and_a_second_call_continues(
+    detected, tmp_path, kind, lost, done
+):
+    detector, folder = detected
+    shutil.copytree(folder / "data", tmp_path / "data")
+    inputs = find_inputs(detector, [tmp_path / "data"])
+    content = inputs.paths[1].read_bytes()
+    inputs.paths[1].write_bytes(content[:-7])
+    out = tmp_path / "out"
+    count, failed = detect_files(detector, inputs, out, file_format=kind)
+    assert (count["frames"], count["done"], list(failed)) == (2, 0, ["7/00001"])
+    assert f"{inputs.paths[1]}: corrupted" in failed["7/00001"]
+    expected = _texts(folder / kind)
+    assert sorted(expected.keys() - _texts(out)) == lost
+    inputs.paths[1].write_bytes(content)
+    count, failed = detect_files(detector, inputs, out, batch_size=2, file_format=kind)
+    assert (count["frames"], count["done"], failed) == (3 - done, done, {})
+    assert _texts(out) == expected
+
+
+def test_an_image_that_cannot_be_read_fails_alone(tmp_path):
+    detector = small.detector("camera", batch_sizes=(2,))
+    images = [tmp_path / f"{i}.png" for i in range(3)]
+    for path, image in zip(images, small.images(3), strict=True):
+        Image.fromarray(image).save(path)
+    camera = small.calibration().camera()
+    frames = small.projections(3)
+    inputs = FrameInputs(
+        ["1/0", "1/1", "1/2"],
+        [None] * 3,
+        frames.__getitem__,
+        [(path, camera) for path in images],
+    )
+    images[1].write_bytes(images[1].read_bytes()[:-60])
+    count, failed = detect_files(detector, inputs, tmp_path / "out", batch_size=2)
+    assert (count["frames"], count["radar_only"], list(failed)) == (2, 0, ["1/1"])
+    expected = detector(frames[[0, 2]], small.images(3)[[0, 2]], small.calibration())
+    for name, boxes in zip("02", expected.to_list(), strict=True):
+        rows = json.loads((tmp_path / "out" / f"1_{name}.json").read_text())
+        assert [row["score"] for row in rows] == pytest.approx(
+            [box["score"] for box in boxes], abs=1e-5
+        )
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            "threshold",
+            r"decode\.score_threshold is 0\.1 there and 0\.3 here; choose anot",
+        ),
+        (
+            "weights",
+            r"options\.weights is '\w{16}' there and '\w{16}' here; choose anot",
+        ),
+        (
+            "frames",
+            r"options\.frames is \['7/00000', .* there and \['7/00000'\] here; ch",
+        ),
+        ("format", r"options\.format is 'json' there and 'kitti' here"),
+        ("manifest", r"7_0000\d\.json is there, but no manifest\.json"),
+    ],
+)
+def test_boxes_of_another_detection_are_not_mixed(detected, tmp_path, change, message):
+    detector, folder = detected
+    shutil.copytree(folder / "json", tmp_path / "out")
+    paths = [folder / "data"]
+    if change == "threshold":
+        detector = small.detector(score_threshold=0.3)
+    elif change == "weights":
+        doubled = jax.tree.map(lambda x: 2 * x, detector.variables)
+        detector = detector.replace(variables=doubled)
+    elif change == "frames":
+        paths = sorted(folder.rglob("*_00000.npy"))
+    elif change == "manifest":
+        (tmp_path / "out" / "manifest.json").unlink()
+    inputs = find_inputs(detector, paths)
+    kind = "kitti" if change == "format" else "json"
+    before = _texts(tmp_path / "out")
+    with pytest.raises(UserError, match=message):
+        detect_files(detector, inputs, tmp_path / "out", file_format=kind)
+    assert _texts(tmp_path / "out") == before
+
+
+def _score(detector, path, num_frames=3):
+    """Load boxes with a ground truth that has an object in each of the frames."""
+    frames = range(num_frames)
+    names = [f"0000{i}_0001{i}" for i in frames]
+    table = {"frame": [*frames], "sequence": [7] * num_frames, "name": names}
+    box = [20.0, 0, 0, 4, 2, 1.5, 0]
+    rows = [{"frame": i, "cls": "Sedan", "box": box} for i in frames]
+    files.write_json(path.parent / "frames.json", table)
+    files.write_json(path.parent / "truth.json", rows)
+    source = Source(ground_truth=str(path.parent / "truth.json"))
+    return load_tables(path, source, detector.classes)
+
+
+@pytest.mark.parametrize(
+    ("kind", "removed", "added", "message"),
+    [
+        ("json", ["7_00001.json"], [], "a partial copy, without 1 of 3 files, such as 7_0"),
+        ("json", ["manifest.*.jsonl", "7_00001.json"], [], "an interrupted job, which did n"),
+        ("json", [], ["7_00009.json"], "1 files that are not of the job that wrote the oth"),
+        ("json", ["manifest*", "7_00001.json"], [], "1 of 3 frames have no file, such as 7/"),
+        ("kitti", ["preds/000001.txt"], [], "a partial copy, without 1 of 4 files"),
+        ("kitti", ["frames.json"], [], "an interrupted job, .* such as frames.json"),
+        ("kitti", ["manifest*", "preds/*2.txt"], [], "1 of 3 frames have no file, such as 7/"),
+        ("kitti", ["manifest*"], ["preds/000003.txt"], "not the names of all files in preds"),
+        ("csv", [], [], "3 of 3 frames have no file"),
+    ],
+)  # fmt: skip
+def test_an_incomplete_folder_has_no_score(
+    detected, tmp_path, kind, removed, added, message
+):
+    detector, folder = detected
+    out = tmp_path / "boxes"
+    shutil.copytree(folder / kind, out)
+    for path in (path for pattern in removed for path in out.glob(pattern)):
+        path.unlink()
+    for name in added:
+        (out / name).write_text("[]" if kind == "json" else "dummy")
+    with pytest.raises(DataError, match=message):
+        _score(detector, out)
+
+
+@pytest.mark.parametrize("kind", ["json", "kitti"])
+def test_frames_that_failed_are_left_out_and_counted(detected, tmp_path, kind):
+    detector, folder = detected
+    out = tmp_path / "boxes"
+    shutil.copytree(folder / kind, out)
+    _, found, frames, counts = _score(detector, out)
+    assert frames["frame"].tolist() == [0, 1, 2]
+    name = {"json": "7_00001.json", "kitti": "preds/000001.txt"}[kind]
+    (out / name).unlink()
+    add(out, name, None)
+    truth, left, frames, counts = _score(detector, out)
+    assert counts == {"frames left out: `radejax detect` failed": 1}
+    assert frames["frame"].tolist() == truth.frame.tolist() == [0, 2]
+    assert len(left) == np.count_nonzero(found.frame != 1) < len(found)
+    with pytest.raises(
+        DataError, match="1 of 4 frames have no file, such as 7/00003_0"
+    ):
+        _score(detector, out, 4)
+
+
 def test_preceding_frames_of_files_are_of_their_sequence(tmp_path):
     """Frames 7, 8 and 10 of a sequence, and 11 of the next one."""
     detector = small.detector(num_frames=2, batch_sizes=(2,))
@@ -128,9 +311,32 @@ def test_preceding_frames_of_files_are_of_their_sequence(tmp_path):
         out = tmp_path / f"out{batch_size}"
         count, _ = detect_files(detector, inputs, out, batch_size=batch_size)
         assert (count["frames"], count["repeated"]) == (4, 3)
-        for path, boxes in zip(sorted(out.iterdir()), expected, strict=True):
+        paths = sorted(out.glob("[12]_*.json"))
+        for path, boxes in zip(paths, expected, strict=True):
             scores = [box["score"] for box in json.loads(path.read_text())]
             assert scores == pytest.approx([box["score"] for box in boxes], abs=1e-5)
+
+
+def test_a_frame_after_one_that_cannot_be_read_has_no_preceding_one(tmp_path):
+    detector = small.detector(num_frames=2, batch_sizes=(2,))
+    frames = small.projections(4)
+    keys = ("1/00007", "1/00008", "1/00009", "1/00010")
+    _write_projections(tmp_path / "data", keys, frames)
+    inputs = find_inputs(detector, [tmp_path / "data"])
+    content = inputs.paths[1].read_bytes()
+    expected = detector(np.stack([frames[[0, 2, 2]], frames[[0, 2, 3]]], 1)).to_list()
+    for batch_size in (1, 2, 8):
+        inputs.paths[1].write_bytes(content[:-7])
+        out = tmp_path / f"out{batch_size}"
+        count, failed = detect_files(detector, inputs, out, batch_size=batch_size)
+        assert (count["frames"], count["repeated"], [*failed]) == (3, 2, [keys[1]])
+        for path, boxes in zip(sorted(out.glob("1_*")), expected, strict=True):
+            scores = [box["score"] for box in json.loads(path.read_text())]
+            assert scores == pytest.approx([box["score"] for box in boxes], abs=1e-5)
+        inputs.paths[1].write_bytes(content)
+        for counts in ((4, 0, 1), (0, 4, 0)):  # the whole part, then nothing
+            count, _ = detect_files(detector, inputs, out, batch_size=batch_size)
+            assert (count["frames"], count["done"], count["repeated"]) == counts
 
 
 def test_two_frames_of_one_name_are_rejected(tmp_path):
