@@ -69,7 +69,7 @@ def _read(
     columns: Columns
     if manifest := Manifest.open(path):
         pattern = "preds/*.txt" if _is_kitti(path) else "*.json"
-        failed = manifest.check_whole(pattern, "run `radejax detect` or copy again")
+        failed = manifest.check_whole(pattern, "detect again, or copy the whole folder")
         pairs = zip(manifest.options.get("frames", ()), manifest.names, strict=False)
         there = {key: name not in failed for key, name in pairs}
     if _is_kitti(path):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+import radejax
 from radejax.cli.main import main
 from radejax.core.errors import DataError, UserError
 from radejax.core.structures import Boxes
@@ -290,6 +291,32 @@ def test_classes_that_do_not_exist_are_wrong_use(
     done = CliRunner().invoke(main, [str(word) for word in words])
     assert done.exit_code == (2 if message else 0)
     assert (message or "") in done.stderr
+
+
+@pytest.mark.parametrize("name", ["metrics.json", "ground_truth.npz", "frames.json"])
+def test_a_part_of_a_report_has_no_score(two_runs, tmp_path, name):
+    shutil.copytree(two_runs / "a" / "seed0" / "evaluation", tmp_path / "report")
+    (tmp_path / "report" / name).unlink()
+    done = CliRunner().invoke(main, ["score", str(tmp_path / "report")])
+    assert done.exit_code != 0
+    assert "Traceback" not in done.output
+    reason = "expected one of the frames that are eval" if name[0] == "f" else name
+    assert reason in done.stderr
+
+
+def test_a_report_replaces_all_of_an_earlier_one(stored):
+    folder, source = stored
+    out = folder / "out"
+    for is_on in (True, False):
+        options = ReportOptions(roi=None, plots=is_on, kitti=is_on, classes=("Sedan",))
+        files.evaluate_files(folder / "found.json", out, source, options)
+        names = {path.name for path in out.iterdir()}
+        assert ("kitti" in names) == is_on
+        assert any(name.startswith("precision_recall_") for name in names) == is_on
+        (out / "notes.txt").touch()
+    assert "notes.txt" in names
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["radejax"] == radejax.__version__
 
 
 def test_own_classes_need_no_option(stored, write_table):

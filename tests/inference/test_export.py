@@ -206,6 +206,28 @@ def test_a_program_that_begins_with_the_tensor(tmp_path):
     assert names == {"README.md", "config.json", "model.safetensors"}
 
 
+@pytest.mark.parametrize(
+    ("files", "named"),
+    [
+        ({"config.json": '{"format": "radejax-2"}', "load.py": "", ".git": ""}, None),
+        ({"config.json": "{}", "model.safetensors": ""}, "config.json"),  # DINOv3
+        ({"config.json": "{}", "metrics.jsonl": ""}, "config.json"),  # a run
+        ({"README.md": "", "notes.txt": ""}, "notes.txt"),
+    ],
+)
+def test_only_an_earlier_export_is_replaced(tmp_path, files, named):
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    if named is None:
+        export.export(small.detector(), tmp_path, kind="huggingface")
+        names = {".git", "README.md", "config.json", "model.safetensors"}
+        assert {path.name for path in tmp_path.iterdir()} == names
+        return
+    with pytest.raises(UserError, match=f"not of an export, such as {named}: choose"):
+        export.export(small.detector(), tmp_path, kind="huggingface")
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == files
+
+
 @pytest.mark.slow
 def test_a_radar_camera_model_too(tmp_path):
     detector = small.detector("camera")

@@ -215,6 +215,15 @@ def test_a_flipped_bit_of_the_weights_is_found(tmp_path):
         with pytest.raises(ValueError, match=r"model\.safetensors: corrupted"):
             exported_loader.load(tmp_path)
     path.write_bytes(content)
+    # The folder was copied in part.
+    for name in ("config.json", "model.safetensors", "detector.stablehlo"):
+        moved = (tmp_path / name).rename(tmp_path / "moved")
+        with pytest.raises(FileNotFoundError, match=name):
+            exported_loader.load(tmp_path)
+        if name != "detector.stablehlo":
+            with pytest.raises(FileNotFoundError, match=name):
+                load_model(tmp_path)
+        moved.rename(tmp_path / name)
     (tmp_path / "detector.stablehlo").write_bytes(b"e program")
     with pytest.raises(ValueError, match=r"detector\.stablehlo: corrupted"):
         exported_loader.load(tmp_path)

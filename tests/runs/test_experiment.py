@@ -133,7 +133,7 @@ def test_a_run_of_two_frames(
     root, out = tmp_path / "data", tmp_path / "boxes"
     assert len(list((root / "records").glob("*/*.npy"))) == 8
     detector = Detector.from_workdir(folder, score_threshold=0.0, batch_sizes=(8,))
-    count = detect_files(detector, find_inputs(detector, [root]), out)
+    count, _ = detect_files(detector, find_inputs(detector, [root]), out)
     assert (count["frames"], count["repeated"]) == (8, 4)
     assert (
         detector.saved.usual_input
