@@ -123,7 +123,7 @@ def _check_train(arguments: list[str]) -> None:
         train.parse_args(context, names)
     settings = load_config(context.params["config"])
     values = {"S": "0", "LABELS.zip": "labels.zip"}
-    texts = context.meta["fields"].items()
+    texts = context.params["fields"].items()
     with_texts(settings, {name: values.get(text, text) for name, text in texts})
 
 

@@ -100,12 +100,12 @@ def simulate(
         if section is None:
             raise UserError(f"{config} has no `simulation` section")
         simulation = section
-    values: dict[str, object] = dict(FULL_SIZE if full_size else {})
+    values = dict(simulation) | (FULL_SIZE if full_size else {})
     if radar is not None:
         values |= read_object(radar, "grid", "radar")
     fields["sequences"] = sequence_numbers
     values |= {name: value for name, value in fields.items() if value is not None}
-    simulation = simulation.replace(**values)
+    simulation = SimulationOptions(**values)  # `replace` would merge both grids
     radejax.simulate(simulation, out, num_workers=num_workers)
     click.echo(f"simulated dataset in {out}")
 

@@ -108,7 +108,7 @@ def test_a_folder_without_frames_says_what_was_looked_for(
 def test_failed_frames_are_listed_with_exit_code_1(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    count = {"frames": 1, "boxes": 2, "clipped": 0, "done": 0}
+    count = {"frames": 1, "boxes": 2, "clipped": 0, "truncated": 0, "done": 0}
     failed = {f"5/{i:05d}": "x of the box is nan" for i in range(30)}
     place = "radejax.inference.detect_files"
     monkeypatch.setattr(f"{place}.find_inputs", lambda *args, **options: None)

@@ -88,4 +88,4 @@ def test_srun_starts_the_preset_with_all_resources(tmp_path):
     assert context.params["roots"] == ("/disk1", "/disk2")
     assert context.params["records"] == "/disk1/records"
     assert context.params["seeds"] == (0, 1, 2)
-    assert context.meta["fields"] == {"train.max_steps": "100"}
+    assert context.params["fields"] == {"train.max_steps": "100"}

@@ -199,8 +199,8 @@ def test_a_program_that_begins_with_the_tensor(tmp_path):
     for region in ((0, 20, None, None, -9, 9), (20, 0, -5, 5, -9, 9)):
         with pytest.raises(ValueError, match=r"roi .* expected x0 < x1"):
             exported_loader.load(tmp_path)(small.projections(1), roi=region)
-    done = export.export(small.detector("camera"), tmp_path, kind="huggingface")
-    assert done["left_out"] == ["params/image_backbone"]
+    _, left_out = export.export(small.detector("camera"), tmp_path, kind="huggingface")
+    assert left_out == ["params/image_backbone"]
     assert "DINOv3" in (tmp_path / "README.md").read_text()
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"README.md", "config.json", "model.safetensors"}

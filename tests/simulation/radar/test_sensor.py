@@ -97,7 +97,9 @@ class TestNoise:
         whole = self.profile_db(GRID, range_profile=1.0)
         half = self.profile_db(GRID, range_profile=0.5)
         np.testing.assert_allclose(half, whole / 2.0, atol=0.3)
-        near = dataclasses.replace(GRID, range_m=np.linspace(0.0, 50.0, 64))
+        near = dataclasses.replace(
+            GRID, range_m=np.linspace(0.0, 50.0, 64), fov_range_m=50.0
+        )
         assert self.profile_db(near, range_profile=1.0)[-1] > 10.0
         assert (self.profile_db(GRID) == 0.0).all()
 

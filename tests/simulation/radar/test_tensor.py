@@ -80,20 +80,6 @@ class TestPhysics:
         response = np.abs(tensor.doppler_response(np.float32([10.0]), grid))[:, 0]
         assert grid.doppler_mps[response.argmax()] == pytest.approx(-1.595, abs=0.031)
 
-    def test_energy_does_not_depend_on_the_grid(self):
-        # A range axis twice as fine over the same resolution: twice the cells, so
-        # energy per meter stays.
-        fine = RadarGrid.reduced(
-            num_doppler=16, num_range=63, num_elevation=9, num_azimuth=24,
-            max_range_m=31.0,
-        )  # fmt: skip
-        sharp = PARAMETERS.replace(range_resolution_m=1.0)
-        coarse_energy = tesseract(points(15.3)).sum() * GRID.range_step_m
-        quiet = np.zeros((63, 16), np.float32)
-        power = tesseract(points(15.3), grid=fine, noise=quiet, parameters=sharp)
-        fine_energy = power.sum() * fine.range_step_m
-        assert fine_energy == pytest.approx(coarse_energy, rel=1e-3)
-
 
 class TestNoise:
     POWER = np.full((32, 16), 7.0, np.float32)
