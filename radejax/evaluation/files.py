@@ -89,8 +89,7 @@ def _read(
         parts = sorted({*path.glob("*.json")} - {path / FILE})
         rows = [row for part in parts for row in _records(part, scored)]
         columns = boxes.columns_of(rows)
-        stems = [part.stem.replace("_", "/", 1) for part in parts]
-        there = there or dict.fromkeys(stems, True)
+        there = there or {part.stem.replace("_", "/", 1): True for part in parts}
     elif path.suffix == ".json":
         columns = boxes.columns_of([*_records(path, scored)])
     elif path.suffix == ".npz":
