@@ -21,7 +21,7 @@ import chex
 import jax
 import numpy as np
 from flax import struct
-from jaxtyping import Bool, Float, Real
+from jaxtyping import ArrayLike, Bool, Float, Real
 
 from radejax.core.errors import DataError, require
 from radejax.core.files import as_path
@@ -136,7 +136,7 @@ def stack_cameras(cameras: Sequence[Camera]) -> Camera:
         (2, 3, 4)
     """
 
-    def stack(*leaves: Array) -> np.ndarray:
+    def stack(*leaves: ArrayLike) -> np.ndarray:
         stacked = np.stack(leaves)
         return stacked if stacked.dtype == bool else stacked.astype(np.float32)
 

@@ -141,7 +141,10 @@ def test_dropped_predictions_and_classes_without_objects_are_counted(scene):
     truth, found, frames = scene
     names = np.where(np.arange(len(found["cls"])) < 3, "Bicycle", found["cls"])
     found = read_boxes({**found, "cls": names}, "predictions", scored=True)
-    parts = [dataclasses.replace(found.take([i]), num_truncated=i) for i in (0, 1, 2)]
+    parts = [
+        dataclasses.replace(found.take(np.array([i])), num_truncated=i)
+        for i in (0, 1, 2)
+    ]
     found = Boxes.concatenate([*parts, found])
     options = ReportOptions(roi=None)
     counts = exclusion_counts(make_set(truth, found, frames, options), options)

@@ -73,7 +73,7 @@ class TestReflection:
         ratio = _reflection(1.0, rough) / _reflection(1.0, EVEN)
         assert ratio == pytest.approx(np.exp(-0.5))
         # (1 - n) / (1 + n) with refractive index 2.
-        assert propagation.reflection(1.0, EVEN, WAVELENGTH) == pytest.approx(-1 / 3)
+        assert _reflection(1.0, EVEN) == pytest.approx(-1 / 3)
 
 
 class TestBounce:
