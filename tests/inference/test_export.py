@@ -97,8 +97,8 @@ def _check(found, suffix, expected):
 def test_a_fresh_process_without_radejax_finds_the_same_boxes(tmp_path):
     detector, projection = small.detector(), small.projections(3)
     folder = tmp_path / "exported"
-    done = export.export(detector, folder)
-    assert done["bytes"] > (folder / "model.safetensors").stat().st_size
+    num_bytes, _ = export.export(detector, folder)
+    assert num_bytes > (folder / "model.safetensors").stat().st_size
     exported = jax.export.deserialize((folder / "detector.stablehlo").read_bytes())
     assert exported.platforms == ("cpu", "cuda", "tpu")
     assert str(exported.in_avals[-4].shape[0]) == "b"
@@ -233,7 +233,8 @@ def test_a_radar_camera_model_too(tmp_path):
     detector = small.detector("camera")
     inputs, arrays = _camera_inputs(detector, 3, embedded=False)
     folder = tmp_path / "exported"
-    assert not export.export(detector, folder, with_backbone=True)["left_out"]
+    _, left_out = export.export(detector, folder, with_backbone=True)
+    assert not left_out
     found = _run_elsewhere(folder, arrays)
     _check(found, "3", detector(*inputs))
     first = jax.tree.map(lambda x: x[:1], inputs)
