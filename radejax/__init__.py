@@ -4,10 +4,10 @@ import importlib
 import sys
 from typing import TYPE_CHECKING
 
+from radejax.core.version import __version__ as __version__
+
 if sys.platform == "win32":
     raise ImportError("radejax runs on Linux and macOS; on Windows, use WSL 2")
-
-__version__ = "0.2.0"
 
 if TYPE_CHECKING:  # the names for editors and type checkers
     from radejax.config import Config as Config

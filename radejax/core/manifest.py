@@ -25,10 +25,10 @@ import time
 import uuid
 from collections.abc import Iterable, Mapping, Sequence
 
-import radejax
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import JsonObject, PathLike
+from radejax.core.version import __version__
 
 _log = logging.getLogger(__name__)
 
@@ -153,7 +153,7 @@ class Manifest:
         folder = files.as_path(folder)
         wanted = {
             "what": what,
-            "radejax": radejax.__version__,
+            "radejax": __version__,
             "options": options,
             "names": list(names),
         }

@@ -30,9 +30,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from tabulate import LATEX_ESCAPE_RULES, tabulate
 
-import radejax
 from radejax.core import files
 from radejax.core.files import JsonObject, PathLike
+from radejax.core.version import __version__
 from radejax.data.kradar.conditions import WEATHERS
 from radejax.evaluation import analysis, protocols
 from radejax.evaluation.boxes import AnyBoxes, Columns, roi_name, write_boxes
@@ -112,7 +112,7 @@ def write_report(
     splits = np.unique(np.asarray(frames.get("split", [])).astype(str))
     metrics: JsonObject = {
         "run": run,
-        "radejax": radejax.__version__,
+        "radejax": __version__,
         "options": options.to_dict(),
         "split": splits.item() if splits.size == 1 else None,
         "is_simulated": data.is_simulated,

@@ -23,11 +23,11 @@ from flax.typing import MutableVariableDict, VariableDict
 from jax.typing import DTypeLike
 from jaxtyping import PyTree
 
-import radejax
 from radejax import models
 from radejax.core import files
 from radejax.core.errors import UserError, require
 from radejax.core.structures import to_float
+from radejax.core.version import __version__
 from radejax.data.cameras import no_images
 from radejax.data.projection import project_jax
 from radejax.geometry.camera import Camera
@@ -182,7 +182,7 @@ def _readme(detector: Detector, shape: Sequence[int], left_out: Sequence[str]) -
         name=type(detector.model).__name__,
         classes=", ".join(detector.classes),
         input=f"{radar} [B, {', '.join(map(str, shape))}] float32, B frames.",
-        radejax=radejax.__version__,
+        radejax=__version__,
         jax=jax.__version__,
         count=config.decode.max_detections,
         left_out=_LEFT_OUT if left_out else "nothing",

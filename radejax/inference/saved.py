@@ -24,12 +24,12 @@ import safetensors.numpy
 from flax.traverse_util import flatten_dict, unflatten_dict
 from flax.typing import VariableDict
 
-import radejax
 from radejax import models
 from radejax.config import Config
 from radejax.core import files
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import JsonObject, PathLike
+from radejax.core.version import __version__
 from radejax.data.kradar.labels import LABEL_CLASSES
 from radejax.data.options import CameraOptions, DataOptions
 from radejax.detection.decode import DecodeOptions
@@ -242,7 +242,7 @@ def save_model(
             file.write(data)
     description = {
         "format": FORMAT,
-        "radejax": radejax.__version__,
+        "radejax": __version__,
         "config": saved.config.without_data_paths(),
         "grid": saved.grid.to_dict(),
         "input": saved.usual_input,

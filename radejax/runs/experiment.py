@@ -34,13 +34,13 @@ from flax.typing import VariableDict
 from jax.sharding import Mesh, NamedSharding
 from jaxtyping import PyTree
 
-import radejax
 from radejax import models
 from radejax.config import Config
 from radejax.core import devices, files
 from radejax.core.errors import UserError, require
 from radejax.core.files import JsonObject, PathLike
 from radejax.core.structures import Batch
+from radejax.core.version import __version__
 from radejax.data.dataset import FrameSequence
 from radejax.data.records import open_embeddings
 from radejax.evaluation.report import Table, number, numbers, write_tables
@@ -419,7 +419,7 @@ def run_info(workdir: pathlib.Path, init_from: PathLike | None = None) -> JsonOb
         init_from = str(files.as_path(init_from).absolute())
     elif (workdir / "run.json").exists():
         init_from = files.read_object(workdir / "run.json").get("init_from")
-    versions = {"radejax": radejax.__version__, "jax": jax.__version__}
+    versions = {"radejax": __version__, "jax": jax.__version__}
     return {
         "init_from": init_from,
         "versions": {**versions, "python": sys.version.split()[0]},
