@@ -19,6 +19,7 @@ import dataclasses
 import functools
 import json
 import logging
+import operator
 import os
 import pathlib
 import time
@@ -66,7 +67,8 @@ def read_sources(folder: pathlib.Path) -> dict[str, State | None]:
             with contextlib.suppress(ValueError):  # the process was killed
                 time_ns, name, state = json.loads(line)
                 lines.append((time_ns, name, state))
-    return {name: state for _, name, state in sorted(lines)}
+    lines.sort(key=operator.itemgetter(0))
+    return {name: state for _, name, state in lines}
 
 
 def warn_of_changes(

@@ -22,8 +22,9 @@ from radejax import models
 from radejax.core.errors import require
 from radejax.core.files import PathLike
 from radejax.core.structures import Array, Batch, Detections, to_float
+from radejax.data import projection
 from radejax.data.cameras import no_images
-from radejax.data.projection import project_jax, stack_frames
+from radejax.data.projection import project_jax, project_tensor, stack_frames
 from radejax.detection.decode import DecodeOptions, decode
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference import inputs as reading
@@ -301,8 +302,10 @@ class Detector:
         radar = self.reader.read_radar(frames, num_frames)
         # Those of `warmup` are all 0.
         if self._num_unchecked and isinstance(radar, np.ndarray) and radar.any():
-            frame = jnp.asarray(radar[0])
-            levels = project_jax(frame) if frame.ndim == 4 else to_float(frame)
+            if radar.ndim == 5:  # on the host, as compiling takes longer
+                levels = self.grid.measured_channels(project_tensor(radar[0]))
+            else:
+                levels = projection.decode(radar[0])
             is_usual = self.saved.check_input(float(levels.mean()), float(levels.std()))
             self._num_unchecked = self._num_unchecked - 1 if is_usual else 0
         return radar
