@@ -125,7 +125,7 @@ def run(
                 "no frames of the test split in %s: the run is trained and not evaluated",
                 ", ".join(data.options.roots),
             )
-        info = run_info(folder, init_from) | {"input": data.input_of("train")}
+        info = run_info(folder, init_from) | {"input": data.usual_input}
         if devices.is_main():
             files.write_json(folder / "run.json", info)
         training_data = TrainingData(
