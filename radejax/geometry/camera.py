@@ -21,7 +21,8 @@ import chex
 import jax
 import numpy as np
 from flax import struct
-from jaxtyping import ArrayLike, Bool, Float, Real
+from jax.typing import ArrayLike
+from jaxtyping import Bool, Float, Real
 
 from radejax.core.errors import DataError, require
 from radejax.core.files import as_path
