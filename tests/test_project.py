@@ -29,8 +29,14 @@ def test_the_package_is_imported_from_the_folder_above_a_clone(
     """There, the clone itself could be a namespace package of the same name."""
     pytest.importorskip("setuptools", "77")
     clone, site = tmp_path / "radejax", tmp_path / "site"
-    (clone / "radejax").mkdir(parents=True)
-    for name in ("pyproject.toml", "README.md", "radejax/__init__.py"):
+    for name in (
+        "pyproject.toml",
+        "README.md",
+        "radejax/__init__.py",
+        "radejax/core/__init__.py",
+        "radejax/core/version.py",
+    ):
+        (clone / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, clone / name)
     script = (
         f"from setuptools import build_meta; build_meta.build_editable({str(site)!r})"

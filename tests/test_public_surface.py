@@ -15,7 +15,7 @@ def test_editors_and_type_checkers_see_every_public_name() -> None:
         and (node.module or "").startswith("radejax")
         for alias in node.names
     }
-    assert declared.keys() == set(radejax.__all__)
+    assert declared.keys() == {*radejax.__all__, "__version__"}
     assert set(radejax.__all__) <= set(dir(radejax))
     for name, (module, attribute) in declared.items():
         imported = getattr(__import__(str(module), fromlist=[""]), attribute)
