@@ -119,7 +119,9 @@ def drawn(module: nn.Module, *inputs: Any, seed: int = 0) -> Any:
     return jax.tree_util.tree_map_with_path(fill, shapes)
 
 
+@functools.cache
 def detector(kind: str = "radar", *, num_frames: int = 1, **overrides: Any) -> Detector:
+    """The same detector for the same arguments, so that it is compiled once."""
     options = {"batch_sizes": (4,), "score_threshold": 0.1} | overrides
     return Detector(saved(kind, data__num_frames=num_frames), **options)
 
