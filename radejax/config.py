@@ -13,7 +13,7 @@ import importlib.util
 import os
 import pathlib
 import types
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Annotated, Any
 
 import pydantic
@@ -22,7 +22,13 @@ from annotated_types import MinLen
 from radejax import models
 from radejax.core.errors import UserError, require
 from radejax.core.files import JsonObject, as_path
-from radejax.core.options import Options, Seed, as_tuples, did_you_mean
+from radejax.core.options import (
+    Options,
+    Seed,
+    as_tuples,
+    did_you_mean,
+    find_function,
+)
 from radejax.core.structures import CLASSES
 from radejax.data.dataset import find_reader
 from radejax.data.options import DATA_PATHS, DataOptions
@@ -34,9 +40,15 @@ from radejax.losses.detection import LossOptions
 from radejax.models.options import RadeNetOptions
 from radejax.simulation.config import SimulationOptions
 from radejax.training.options import LoggingOptions, TrainOptions
+from radejax.training.step import OPTIMIZERS, SCHEDULES
 
 CONFIGS = pathlib.Path(__file__).resolve().parent / "configs"
 """Folder of the bundled configs; in a checkout, a link to the one next to the package."""
+
+_TRAINING_PARTS: dict[str, Mapping[str, Callable[..., object]]] = {
+    "optimizer": OPTIMIZERS,
+    "schedule": SCHEDULES,
+}
 
 
 class Config(Options):
@@ -89,6 +101,9 @@ class Config(Options):
         classes = f"{len(self.classes)}, the number of config.classes"
         is_equal = count == len(self.classes)
         require(is_equal, "config.model.num_classes", count, classes)
+        for name, parts in _TRAINING_PARTS.items():
+            if ":" not in (part := getattr(self.train, name)):
+                find_function(part, f"config.train.{name}", parts)
         if self.train.evaluate_every_epochs:
             ious = self.evaluation.iou_thresholds
             known = [
@@ -104,7 +119,7 @@ class Config(Options):
         return self
 
     def check_imports(self) -> None:
-        """Imports the reader, loss terms and protocols that are named as "module:Object".
+        """Imports all parts outside of the network that are named as "module:Object".
 
         Loading a model does not import them.
 
@@ -114,6 +129,13 @@ class Config(Options):
         find_reader(self.data.format).check_options(self.data, self.classes)
         self.loss.find_terms()
         self.evaluation.find_protocols()
+        self.evaluation.find_metrics()
+        for name, parts in _TRAINING_PARTS.items():
+            find_function(getattr(self.train, name), f"config.train.{name}", parts)
+        for hook in self.train.hooks:
+            find_function(hook, "config.train.hooks")
+        for function in self.data.augmentation:
+            find_function(function, "config.data.augmentation")
 
     def without_data_paths(self) -> JsonObject:
         """Returns plain values for JSON with the data paths (`DATA_PATHS`) emptied."""

@@ -67,15 +67,32 @@ def _config() -> Config:
         "neck": "parts:StripNeck",
         "heads": "parts:WideHead",
     }
+    fields["outputs"] = {"velocity": 2}
     return config.replace(
         model=parts.PowerOptions(**dict(config.model) | fields),
-        loss={"own_terms": ("parts:height_loss",), "weights": {"height_loss": 0.5}},
-        data={"format": "toy:Toy"},
-        train={"batch_size": 2, "num_epochs": 1, "warmup_steps": 0},
+        loss={
+            "own_terms": ("parts:height_loss", "parts:velocity_loss"),
+            "weights": {"height_loss": 0.5, "velocity_loss": 0.5},
+        },
+        data={
+            "format": "toy:Toy",
+            "targets": ("velocity_mps",),
+            "augmentation": ("parts:random_gain",),
+        },
+        train={
+            "batch_size": 2,
+            "num_epochs": 1,
+            "warmup_steps": 0,
+            "optimizer": "parts:lion",
+            "schedule": "parts:one_cycle",
+            "hooks": ("parts:parameter_norm",),
+            "freeze": ("backbone/ConvGNSiLU_0*",),
+        },
         evaluation={
             "batch_size": 2,
             "num_visualizations": 0,
             "protocols": ("parts:EVERY_FRAME", "all_point"),
+            "metrics": ("parts:speed_error_mps",),
         },
     )
 
@@ -98,6 +115,7 @@ def _write_toy(root: pathlib.Path) -> pathlib.Path:
             power=rng.uniform(1e3, 1e9, grid.shape_drea).astype(np.float32),
             boxes=np.array([[12.0, 1.0, 0.0, 4.2, 1.8, 1.6, 0.1]] * 2),
             classes=np.array(["Sedan", "Tram"]),
+            velocity_mps=np.array([[3.0, 0.5], [np.nan, np.nan]]),
         )
     return root
 
@@ -177,7 +195,11 @@ def test_objects_that_cannot_be_learned_are_left_out_and_counted(
     good = [12.0, 1.0, 0.0, 4.2, 1.8, 1.6, 0.1]
     boxes = np.array([good] * 5)
     boxes[1, 2], boxes[2, 4], boxes[3, 0], boxes[4, 1] = np.nan, -1.0, -12.0, 99.0
-    content = dict(np.load(path)) | {"boxes": boxes, "classes": np.array(["Sedan"] * 5)}
+    content = dict(np.load(path)) | {
+        "boxes": boxes,
+        "classes": np.array(["Sedan"] * 5),
+        "velocity_mps": np.zeros((5, 2)),
+    }
     np.savez(path, **content)
     config = located(_config().replace(data={"roots": (str(root),)}))
     data = Data(config)
@@ -252,7 +274,8 @@ def test_own_parts_are_imported_wherever_a_run_is_opened(
     experiment.run(config, folder, mesh=one_device)
     row: dict[str, Any] = json.loads((folder / "metrics.jsonl").read_text())
     assert row["step"] == 1
-    assert np.isfinite([row[name] for name in ("focal", "gwd", "height_loss")]).all()
+    terms = ("focal", "gwd", "height_loss", "velocity_loss")
+    assert np.isfinite([row[name] for name in terms]).all()
     _forget()
     assert evaluate_run(folder) is not None
     metrics = json.loads((folder / "evaluation" / "metrics.json").read_text())

@@ -40,6 +40,7 @@ class Toy(LabelledFrames):
                     name=path.stem,
                     boxes=content["boxes"][kept],
                     classes=content["classes"][kept],
+                    columns={"velocity_mps": content["velocity_mps"][kept]},
                     environment="urban",
                     time="day",
                     weather="normal",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 from collections.abc import Mapping
 from typing import Any
@@ -56,6 +57,11 @@ class _Command(entry.Command):
 @click.option(
     "--init-from", help="Initial weights: an official .pth file or another workdir."
 )
+@click.option(
+    "--init-partial",
+    help="A workdir, exported folder or .pth file whose weights are used where name and "
+    "shape are equal.",
+)
 @entry.several(
     "--seeds",
     kind=int,
@@ -82,6 +88,7 @@ def train(
     fields: Mapping[str, str],
     workdir: str | None,
     init_from: str | None,
+    init_partial: str | None,
     seeds: tuple[int, ...] | None,
     profile: str | None,
     distributed: bool,
@@ -113,10 +120,10 @@ def train(
         settings = with_texts(load_config(config), fields)
         data["sequences"] = data.pop("sequence_numbers")
         settings = settings.replace(data={name: x for name, x in data.items() if x})
+        start = functools.partial(run, settings, workdir)
         if seeds:
-            run_seeds(settings, workdir, seeds, init_from=init_from, profile=profile)
-        else:
-            run(settings, workdir, init_from=init_from, profile=profile)
+            start = functools.partial(run_seeds, settings, workdir, seeds)
+        start(init_from=init_from, init_partial=init_partial, profile=profile)
 
 
 def join_processes(

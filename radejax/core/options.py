@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import importlib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self, TypeVar
 
 import pydantic
@@ -15,6 +15,7 @@ from radejax.core.errors import UserError, require
 from radejax.core.files import JsonObject
 
 Part = TypeVar("Part")
+Function = TypeVar("Function", bound=Callable[..., object])
 
 Size = Annotated[int, Ge(1), Le(1 << 16)]
 """A number of channels, classes, heads or similar."""
@@ -217,6 +218,15 @@ def find_part(
             ) from None
     is_kind = kind in getattr(part, "__mro__", type(part).__mro__)
     require(is_kind, field, name, f"the name of a {kind.__name__}")
+    return part
+
+
+def find_function(
+    name: str, field: str, known: Mapping[str, Function] | None = None
+) -> Function:
+    """Returns the function that a field of a config names, see `find_part`."""
+    part = find_part(name, field, known or {})
+    require(callable(part), field, name, "the name of a function")
     return part
 
 

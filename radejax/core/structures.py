@@ -85,6 +85,8 @@ class Batch(struct.PyTreeNode):
             backbone computed from them, or None.
         camera: `Camera` or `ReferencePoints` with a leading axis B, or None. Both are
             defined in higher layers.
+        targets: `[B, N, ...]` columns of `config.data.targets` by name; NaN where a value
+            is unknown, 0 where not `is_valid`.
     """
 
     # Leaves are not validated: JAX also rebuilds the tree with shapes, specs or None.
@@ -95,6 +97,7 @@ class Batch(struct.PyTreeNode):
     frame: Int[Array, " B"]
     image: Real[Array, "B _ _ _"] | None = None
     camera: PyTree[Array] | None = None
+    targets: dict[str, Array] = struct.field(default_factory=dict)
 
     def model_inputs(self) -> tuple[PyTree[Array], ...]:
         """Returns the positional inputs of a model.
@@ -127,10 +130,12 @@ class DetectionMaps(struct.PyTreeNode):
         heatmap_logits: Logits of the center heatmap, before the sigmoid.
         box_params: Raw dx, dy, z, l, w, h, sin yaw, cos yaw; dx and dy are offsets from
             the center of the bin in meters.
+        outputs: Further predictions `[B, R, A, ...]` by name, see `config.model.outputs`.
     """
 
     heatmap_logits: Float[jax.Array, "B R A C"]
     box_params: Float[jax.Array, "B R A 8"]
+    outputs: dict[str, jax.Array] = struct.field(default_factory=dict)
 
 
 class Detections(struct.PyTreeNode):
@@ -143,6 +148,7 @@ class Detections(struct.PyTreeNode):
         is_valid: True where a row is a detection and not padding.
         num_truncated: int32 number of peaks before NMS and boxes after it that were
             dropped because of the fixed number of rows, see `detection.decode.decode`.
+        outputs: `[B, K, ...]` further outputs of the model at the boxes' bins, by name.
         class_names: Names of the detector's classes by class index; static under `jit`.
     """
 
@@ -151,6 +157,7 @@ class Detections(struct.PyTreeNode):
     classes: Int[jax.Array, "B K"]
     is_valid: Bool[jax.Array, "B K"]
     num_truncated: Int[jax.Array, " B"]
+    outputs: dict[str, jax.Array] = struct.field(default_factory=dict)
     class_names: tuple[str, ...] = struct.field(pytree_node=False, default=CLASSES)
 
     def __repr__(self) -> str:
@@ -176,6 +183,7 @@ class Detections(struct.PyTreeNode):
             box=np.asarray(self.boxes, np.float64)[position, row],
             cls=np.asarray(self.class_names, object)[cls].astype(str),
             score=np.asarray(self.scores, np.float64)[position, row],
+            extras={n: np.asarray(x)[position, row] for n, x in self.outputs.items()},
             num_truncated=int(np.asarray(self.num_truncated)[indices >= 0].sum()),
         )
 
@@ -195,7 +203,8 @@ class Detections(struct.PyTreeNode):
         import pandas
 
         boxes = self.to_boxes()
-        return pandas.DataFrame({"frame": boxes.frame, **boxes.fields()})
+        fields = {name: x.tolist() for name, x in boxes.fields().items()}
+        return pandas.DataFrame({"frame": boxes.frame, **fields})
 
 
 MAX_BOX_VALUE = 1e6

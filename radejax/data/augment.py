@@ -7,6 +7,7 @@ every grid whose azimuth axis is symmetric.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float, Int, Real
@@ -21,11 +22,13 @@ class Sample:
     """One row of a batch before it is written into the batch.
 
     Attributes:
-        projection: Projection of the frame and of those that precede it.
+        projection: Projection of the frame and of those that precede it, in the dtype of
+            the records.
         boxes: x, y, z, l, w, h, sin yaw, cos yaw, padded with zeros.
         classes: Class indices, padded with -1.
         image: Image or features; None for radar-only models.
         camera: Camera; None for radar-only models.
+        targets: Columns of `config.data.targets` `[N, ...]` by name.
     """
 
     projection: Real[np.ndarray, "R A C"]
@@ -33,6 +36,7 @@ class Sample:
     classes: Int[np.ndarray, " N"]
     image: Real[np.ndarray, "_ _ _"] | None = None
     camera: Camera | None = None
+    targets: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +46,7 @@ class Augmentation:
     Attributes:
         grid: Sensor axes of the projections.
         mirror_probability: Probability of swapping left and right.
+        others: Functions that are called afterwards in the same way, in their order.
 
     Raises:
         UserError: Mirroring is enabled for a grid whose azimuth axis is not symmetric.
@@ -49,6 +54,7 @@ class Augmentation:
 
     grid: RadarGrid
     mirror_probability: float = 0.0
+    others: Sequence[Callable[[Sample, np.random.Generator], Sample]] = ()
 
     def __post_init__(self) -> None:
         azimuth = self.grid.azimuth_rad
@@ -61,8 +67,12 @@ class Augmentation:
             )
 
     def __call__(self, sample: Sample, rng: np.random.Generator) -> Sample:
-        """Returns the sample or a mirrored copy of it."""
-        return mirror(sample) if rng.random() < self.mirror_probability else sample
+        """Returns the sample or a changed copy of it."""
+        if rng.random() < self.mirror_probability:
+            sample = mirror(sample)
+        for function in self.others:
+            sample = function(sample, rng)
+        return sample
 
 
 def mirror(sample: Sample) -> Sample:

@@ -11,7 +11,7 @@ import collections
 import copy
 import dataclasses
 import pathlib
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Self, TypeVar, overload
 
 import numpy as np
@@ -91,6 +91,8 @@ class LabelledFrame:
         name: Name that is unique in the sequence.
         boxes: x, y, z, l, w, h, yaw in the radar frame, in meters and radians.
         classes: Class names of `boxes`.
+        columns: Further values of the objects by name, one row per box. K-Radar's reader
+            has "track_id", "velocity_mps" and "visibility".
         environment, time, weather: Conditions by which results are tabulated.
         radar_path: File of the radar tensor, or None if it is missing.
         camera_path: Image of the (left) front camera, or None if it is missing.
@@ -107,6 +109,9 @@ class LabelledFrame:
     name: str
     boxes: Float[np.ndarray, "N 7"]
     classes: Shaped[np.ndarray, " N"]
+    columns: Mapping[str, Shaped[np.ndarray, "N ..."]] = dataclasses.field(
+        default_factory=dict
+    )
     environment: str = "unknown"
     time: str = "unknown"
     weather: str = "unknown"

@@ -112,6 +112,10 @@ class DataOptions(Options, section="config.data"):
     0: the main thread reads them."""
     mirror_probability: Fraction = 0.0
     """Probability of mirroring a frame left to right."""
+    augmentation: tuple[str, ...] = ()
+    """Further augmentations in their order, each module:function."""
+    targets: tuple[str, ...] = ()
+    """Columns of the labels, such as velocity_mps, that loss terms and metrics use."""
     label_permutation_seed: Annotated[int, Ge(0)] | None = None
     """Sanity check: shuffles the labels of the training frames with this seed."""
     camera: CameraOptions | None = None
@@ -128,6 +132,10 @@ class DataOptions(Options, section="config.data"):
         is_fine = is_fraction or (are_numbers and len(set(values)) == len(values))
         expected = "different sequence numbers, or one fraction between 0 and 1"
         require(is_fine, "config.data.validation", values, f"{expected}; () for none")
+        expected = "0 with config.data.targets: mirror in an own augmentation"
+        is_fine = not (self.targets and self.mirror_probability)
+        name = "config.data.mirror_probability"
+        require(is_fine, name, self.mirror_probability, expected)
         return self
 
     @property

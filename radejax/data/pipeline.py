@@ -12,15 +12,15 @@ import dataclasses
 import functools
 import logging
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import grain
 import jax
 import numpy as np
 from jaxtyping import Float, Int, Real
 
-from radejax.core.errors import UserError
-from radejax.core.structures import CLASSES, Batch
+from radejax.core.errors import UserError, require
+from radejax.core.structures import CLASSES, Array, Batch
 from radejax.core.workers import usable_cpus
 from radejax.data.augment import Augmentation, Sample
 from radejax.data.cameras import CameraInputs, no_camera
@@ -107,6 +107,7 @@ class FrameTable:
         boxes: float32 x, y, z, l, w, h, sin yaw, cos yaw, padded with zeros.
         classes: int32 class indices, padded with -1.
         images: Images and cameras of the frames, or None for radar-only models.
+        targets: float32 columns of the objects by name, NaN where a value is unknown.
     """
 
     records: Records
@@ -114,6 +115,9 @@ class FrameTable:
     boxes: Float[np.ndarray, "F N 8"]
     classes: Int[np.ndarray, "F N"]
     images: CameraInputs | None = None
+    targets: Mapping[str, Float[np.ndarray, "F N ..."]] = dataclasses.field(
+        default_factory=dict
+    )
 
     def __len__(self) -> int:
         return len(self.keys)
@@ -127,6 +131,7 @@ def make_table(
     classes: Sequence[str] = CLASSES,
     images: CameraInputs | None = None,
     num_frames: int = 1,
+    targets: Sequence[str] = (),
 ) -> FrameTable:
     """Builds the padded label table of the frames, with their records.
 
@@ -139,10 +144,12 @@ def make_table(
         images: Camera inputs of the same frames in the same order (see
             `camera_inputs`), or None for radar-only models.
         num_frames: Number of frames of a sample, see `frame_histories`.
+        targets: Names of further columns of the objects.
 
     Raises:
         UserError: A frame has more than `max_objects` objects (the message states the
-            required number), a frame has no record, or there are no frames.
+            required number), a frame has no record, there are no frames, or no frame has
+            one of the `targets`.
     """
     if not len(frames):
         raise UserError("no frames: the dataset or the split is empty")
@@ -161,12 +168,26 @@ def make_table(
     shape = (len(frames), max_objects)
     boxes = np.zeros((*shape, 8), np.float32)
     indices = np.full(shape, -1, np.int32)
+    columns = {name: _empty_column(frames, name, shape) for name in targets}
     for i, frame in enumerate(frames):
         rows = np.flatnonzero(kept[i])
         boxes[i, : len(rows)] = boxes8_from_7(frame.boxes[rows])
         indices[i, : len(rows)] = [class_index[frame.classes[row]] for row in rows]
+        for name in columns.keys() & frame.columns.keys():
+            columns[name][i, : len(rows)] = frame.columns[name][rows]
     keys = sample_keys(records, frames, num_frames)
-    return FrameTable(records, keys, boxes, indices, images)
+    return FrameTable(records, keys, boxes, indices, images, columns)
+
+
+def _empty_column(
+    frames: FrameSequence, name: str, shape: tuple[int, int]
+) -> Float[np.ndarray, "F N ..."]:
+    """Returns a column of the objects of all frames without known values."""
+    found = [frame.columns[name] for frame in frames if name in frame.columns]
+    known = sorted({name for frame in frames for name in frame.columns})
+    expected = f"a column of the labels: {', '.join(known) or 'they have none'}"
+    require(len(found) > 0, "config.data.targets", name, expected)
+    return np.full((*shape, *found[0].shape[1:]), np.nan, np.float32)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -328,10 +349,13 @@ class _LoadBatch(grain.transforms.Map):
         sample = self._sample(index)
         if self._augment is not None:
             sample = self._augment(sample, np.random.default_rng(seed))
+            _check_augmented(sample.projection, batch.projection[row])
         batch.projection[row] = sample.projection
         batch.boxes[row] = sample.boxes
         batch.classes[row] = sample.classes
         batch.is_valid[row] = sample.classes >= 0
+        for name, values in batch.targets.items():
+            values[row] = sample.targets[name]
         batch.frame[row] = index
         if batch.image is not None:
             batch.image[row] = sample.image
@@ -342,7 +366,12 @@ class _LoadBatch(grain.transforms.Map):
         table = self._table
         images = self._table.images
         projection = read_sample(table.records, table.keys[index])
-        sample = Sample(projection, table.boxes[index], table.classes[index])
+        sample = Sample(
+            projection,
+            table.boxes[index],
+            table.classes[index],
+            targets={name: values[index] for name, values in table.targets.items()},
+        )
         if images is None:
             return sample
         return dataclasses.replace(
@@ -363,4 +392,17 @@ class _LoadBatch(grain.transforms.Map):
             is_valid=np.zeros(rows, bool),
             frame=np.full(size, -1, np.int32),
             image=None if images is None else images.empty_images(size),
+            targets={
+                name: np.zeros((size, *values.shape[1:]), np.float32)
+                for name, values in self._table.targets.items()
+            },
         )
+
+
+def _check_augmented(found: Real[Array, "..."], usual: Real[Array, "R A C"]) -> None:
+    """Raises `UserError` if an augmentation returned another kind of projection."""
+    is_same = found.shape == usual.shape
+    is_same = is_same and np.can_cast(found.dtype, usual.dtype, "same_kind")
+    text = f"a projection {found.shape} {found.dtype}"
+    expected = f"{usual.shape} {usual.dtype}, as in the records"
+    require(is_same, "the result of config.data.augmentation", text, expected)

@@ -83,6 +83,7 @@ class Peaks(struct.PyTreeNode):
         is_valid: `[B, P]` bool, True where a row contains a peak.
         num_found: `[B]` int32 number of all peaks that pass the threshold and the region,
             including those beyond P.
+        outputs: `[B, P, ...]` further outputs of the model at these bins, by name.
     """
 
     bins: jax.Array
@@ -91,6 +92,7 @@ class Peaks(struct.PyTreeNode):
     classes: jax.Array
     is_valid: jax.Array
     num_found: jax.Array
+    outputs: dict[str, jax.Array] = struct.field(default_factory=dict)
 
 
 def decode(
@@ -250,6 +252,7 @@ def find_peaks(
         classes=classes.astype(jnp.int32),
         is_valid=top > 0,
         num_found=jnp.sum(best > 0, axis=-1, dtype=jnp.int32),
+        outputs={n: _rows_at(_flat_bins(x), flat) for n, x in maps.outputs.items()},
     )
 
 
@@ -303,8 +306,9 @@ def _compact(
         num_truncated=peaks.num_found
         - num_entered
         + jnp.maximum(num_kept - max_detections, 0),
+        outputs={name: _rows_at(x, order) for name, x in peaks.outputs.items()},
     )
 
 
-def _flat_bins(values: Num[jax.Array, "B R A C"]) -> Num[jax.Array, "B R*A C"]:
-    return values.reshape(values.shape[0], -1, values.shape[-1])
+def _flat_bins(values: Num[jax.Array, "B R A ..."]) -> Num[jax.Array, "B R*A ..."]:
+    return values.reshape(values.shape[0], -1, *values.shape[3:])

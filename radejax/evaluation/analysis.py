@@ -9,15 +9,16 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from jaxtyping import Bool, Int, Shaped
 
+from radejax.core.errors import require
 from radejax.evaluation.boxes import Columns
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import pooled_curve
-from radejax.evaluation.results import condition_masks
+from radejax.evaluation.results import Metric, condition_masks
 from radejax.geometry.boxes import MIN_OBJECTS, find_size_problem
 
 DISTANCES_M = (0.0, 20.0, 40.0, 60.0, 80.0, float("inf"))
@@ -124,10 +125,17 @@ def _numbers(
     }
 
 
-def box_errors(data: EvaluationSet, iou: float) -> dict[str, dict[str, float]]:
+def box_errors(
+    data: EvaluationSet, iou: float, metrics: Mapping[str, Metric] | None = None
+) -> dict[str, dict[str, float]]:
     """Computes mean and median errors per class of boxes matched in the bird's-eye view.
 
     Predictions with a score of 0 are left out.
+
+    Args:
+        data: Evaluation set.
+        iou: IoU threshold.
+        metrics: Further errors by name. Values that are NaN do not count.
 
     Returns:
         For each class, the number of matches "count" and, as "<error>_mean" and
@@ -157,13 +165,20 @@ def box_errors(data: EvaluationSet, iou: float) -> dict[str, dict[str, float]]:
         "heading_deg": np.rad2deg(turn),
         "axis_deg": np.rad2deg(np.minimum(turn, np.pi - turn)),
     }
+    pairs = data.matched_pairs(rows, match[rows])
+    for name, metric in (metrics or {}).items():
+        errors[name] = values = np.asarray(metric(*pairs), np.float64)
+        expected = f"an array [{len(rows)}], one value per matched box"
+        is_fine = values.shape == rows.shape
+        require(is_fine, f"the metric {name} returned", values.shape, expected)
     result = {}
     for cls, name in enumerate(data.classes):
         mine = data.pred.cls[rows] == cls
         numbers: dict[str, float] = {"count": int(mine.sum())}
         for what, values in errors.items():
-            numbers[f"{what}_mean"] = _or_nan(np.mean, values[mine])
-            numbers[f"{what}_median"] = _or_nan(np.median, values[mine])
+            known = values[mine & ~np.isnan(values)]
+            numbers[f"{what}_mean"] = _or_nan(np.mean, known)
+            numbers[f"{what}_median"] = _or_nan(np.median, known)
         numbers["reversed"] = _or_nan(np.mean, turn[mine] > np.pi / 2)
         result[name] = numbers
     return result

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int, Real, Shaped
+from jaxtyping import Bool, Float, Int, Real, Shaped
 from numpy.typing import ArrayLike
 
 from radejax.core.errors import DataError, UserError, require
@@ -101,6 +101,8 @@ def columns_of_boxes(table: AnyBoxes) -> Columns:
 def read_boxes(table: AnyBoxes, name: str, *, scored: bool) -> Boxes:
     """Reads boxes from the columns frame, box, cls and, for predictions, score.
 
+    Further columns of numbers become `extras`.
+
     Args:
         table: Boxes, or columns by name.
         name: Name of the table in errors, such as "predictions".
@@ -122,8 +124,11 @@ def read_boxes(table: AnyBoxes, name: str, *, scored: bool) -> Boxes:
     box = columns["box"].astype(np.float64)
     box = box if frame.size else np.zeros((0, 7))  # an empty list has no width
     score = columns["score"].astype(np.float64) if scored else None
+    usual = ("frame", "box", "cls", "score")
+    others = {name: x for name, x in columns.items() if name not in usual}
+    extras = {name: x for name, x in others.items() if x.dtype.kind in "biuf"}
     try:
-        return Boxes(frame, box, columns["cls"].astype(str), score)
+        return Boxes(frame, box, columns["cls"].astype(str), score, extras)
     except DataError as error:
         raise DataError(f"{name}: {error}") from None
 
@@ -267,7 +272,9 @@ def columns_of(
 
 
 def tables_from_frames(
-    frames: Iterable[LabelledFrame], split: str | None = None
+    frames: Iterable[LabelledFrame],
+    split: str | None = None,
+    targets: Sequence[str] = (),
 ) -> tuple[Boxes, Columns]:
     """Builds ground truth and frame table of a dataset such as `radejax.data.kradar.KRadar`.
 
@@ -275,6 +282,8 @@ def tables_from_frames(
         frames: The labelled frames.
         split: Split to store in the frame table: "train", "test", "all" or a split file;
             None if it is not known.
+        targets: Names of the frames' `columns` that become columns of the ground truth, NaN
+            in frames without them.
 
     Returns:
         The ground truth and the frame columns. The frame id is the position in `frames`.
@@ -288,10 +297,12 @@ def tables_from_frames(
     ids = np.arange(len(frames))
     box = [np.asarray(frame.boxes, np.float64).reshape(-1, 7) for frame in frames]
     cls = [str(name) for frame in frames for name in frame.classes]
+    extras = {name: _joined(frames, name) for name in targets}
     ground_truth = Boxes(
         np.repeat(ids, np.array([len(rows) for rows in box], int)),
         np.concatenate([np.zeros((0, 7)), *box]),
         np.array(cls, dtype=str),
+        extras=extras,
     )
     table = {"frame": ids}
     for column in ("sequence", "name", "weather", "environment", "time"):
@@ -300,6 +311,19 @@ def tables_from_frames(
     if split is not None:
         table["split"] = np.full(len(frames), str(split))
     return ground_truth, table
+
+
+def _joined(frames: Sequence[LabelledFrame], name: str) -> Float[np.ndarray, "N ..."]:
+    """Returns a column of the objects of all frames, NaN in frames without it."""
+    found = [frame.columns[name] for frame in frames if name in frame.columns]
+    inner = found[0].shape[1:] if found else ()
+    parts = [
+        np.asarray(frame.columns[name], np.float64)
+        if name in frame.columns
+        else np.full((len(frame.boxes), *inner), np.nan)
+        for frame in frames
+    ]
+    return np.concatenate([np.zeros((0, *inner)), *parts])
 
 
 def write_boxes(path: PathLike, boxes: Boxes, frames: AnyColumns) -> None:

@@ -233,6 +233,18 @@ class EvaluationSet:
         truth = self.ground_truth.take(np.sort(self._gt_row[gt]))
         return truth, self.predictions.take(np.sort(self._pred_row[pred]))
 
+    def matched_pairs(
+        self, pred: Int[np.ndarray, " K"], gt: Int[np.ndarray, " K"]
+    ) -> tuple[Boxes, Boxes]:
+        """Returns predictions and their objects as they were given, with all columns.
+
+        Args:
+            pred: Positions in `pred`.
+            gt: Positions of their objects in `gt`.
+        """
+        found = self.predictions.take(self._pred_row[pred])
+        return found, self.ground_truth.take(self._gt_row[gt])
+
     def of_frames(self, is_chosen: Bool[np.ndarray, " F"]) -> EvaluationSet:
         """Returns the evaluation set of some frames, such as those of one condition."""
         chosen = is_chosen[self.gt.frame], is_chosen[self.pred.frame]

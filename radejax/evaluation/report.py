@@ -126,7 +126,7 @@ def write_report(
         else "none: they need --bootstrap and frames of two sequences or more",
         "ap": [to_row(result) for result in results],
         "subsets": subsets | analysis.subsets(data, frames, iou),
-        "box_errors": analysis.box_errors(data, iou),
+        "box_errors": analysis.box_errors(data, iou, options.find_metrics()),
         "worst_frames": analysis.worst_frames(data, frames, iou),
     }
     metrics = plain(metrics)

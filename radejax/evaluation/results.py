@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Annotated, Any, Literal, TypedDict
 
 import numpy as np
@@ -20,7 +20,14 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from radejax.core.errors import UserError, require
 from radejax.core.files import JsonObject
-from radejax.core.options import AtLeastOne, BelowOne, Count, Fraction, Options
+from radejax.core.options import (
+    AtLeastOne,
+    BelowOne,
+    Count,
+    Fraction,
+    Options,
+    find_function,
+)
 from radejax.core.structures import CLASSES, MIN_SIZE_M, NARROW_ROI, Boxes
 from radejax.data.kradar.conditions import WEATHERS
 from radejax.evaluation import protocols
@@ -35,6 +42,9 @@ from radejax.evaluation.evaluation_set import EvaluationSet, Result, mean_ap
 
 LEVEL = 0.95
 """Confidence level of all intervals."""
+
+Metric = Callable[[Boxes, Boxes], Float[np.ndarray, " K"]]
+"""Own error of matched boxes: a function of the predictions and their objects, row by row."""
 
 Region = Literal["narrow", "wide"] | tuple[float, ...] | None
 Names = Annotated[tuple[str, ...], MinLen(1)]
@@ -51,6 +61,8 @@ class EvaluationOptions(Options, section="config.evaluation"):
     empty_frames: Literal["protocol", "class", "frame", "none"] = "protocol"
     """Frames that are excluded: protocol (by the protocol's own rule), class (frames
     without an object of the class), frame (frames without any object), none."""
+    metrics: tuple[str, ...] = ()
+    """Further errors of matched boxes, each module:function."""
     iou_thresholds: Thresholds = (0.3, 0.5)
     """IoU thresholds."""
     score_threshold: Fraction = 0.3
@@ -85,6 +97,18 @@ class EvaluationOptions(Options, section="config.evaluation"):
                 protocols.get_protocol(name)
         except UserError as error:
             raise UserError(f"config.evaluation.{error}") from None
+
+    def find_metrics(self) -> dict[str, Metric]:
+        """Returns the functions of `metrics` by name.
+
+        Raises:
+            UserError: One of them cannot be imported.
+        """
+        field = "config.evaluation.metrics"
+        return {
+            place.partition(":")[2]: find_function(place, field)
+            for place in self.metrics
+        }
 
 
 class Settings(TypedDict):

@@ -39,7 +39,12 @@ from radejax.models.lifting import OFFICIAL_OFFSET_M
 from radejax.models.options import DinoRadeOptions, RadeNetOptions
 from radejax.models.radenet import RadeNet
 from radejax.weights import dinorade_torch, image_backbone, radenet_torch
-from radejax.weights.convert import StateDict, check_finite, read_state_dict
+from radejax.weights.convert import (
+    StateDict,
+    check_finite,
+    read_state_dict,
+    variable_shapes,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -303,11 +308,13 @@ def _read_checkpoint(path: pathlib.Path, step: Step) -> SavedModel:
         )
     # Orbax takes a second to import, and the other kinds of models do not need it.
     from radejax.training.checkpoints import Checkpoints
+    from radejax.training.step import merge_parameters
 
     with Checkpoints(folder, read_only=True) as checkpoints:
         chosen = checkpoints.best_step() if step == "best" else step
         state, info, number = checkpoints.restore_variables(chosen)
-    params = state["ema_params"] if state.get("ema_params") else state["params"]
+    trained = state["ema_params"] if state.get("ema_params") else state["params"]
+    params = merge_parameters(trained, state.get("frozen") or {})
     return SavedModel(
         Config(**info["config"]),
         RadarGrid.from_dict(info["grid"]),
@@ -412,3 +419,37 @@ def _fitting_variables(path: PathLike, options: RadeNetOptions) -> VariableDict:
     variables = load_torch(path, **structure).variables
     image_backbone.check_fits(models.build(options), variables, path)
     return variables
+
+
+def matching_weights(path: PathLike, model: RadeNet) -> VariableDict:
+    """Read those weights of another model that have the name and shape of a model's.
+
+    The numbers of arrays, and the parts of the model with arrays that do not match, are
+    logged. Weights of a frozen image backbone are not taken.
+
+    Args:
+        path: Path of a model that `load_model` accepts.
+        model: Model that is trained.
+
+    Raises:
+        UserError: No weights match.
+    """
+    wanted = variable_shapes(model)
+    found = flatten_dict(load_model(path).variables, sep="/")
+    own = tuple(f"params/{part}/" for part in models.external_parts(model))
+    found = {name: x for name, x in found.items() if not name.startswith(own)}
+    same = {name: x for name, x in found.items() if wanted.get(name) == x.shape}
+    require(len(same) > 0, "--init-partial", path, "a model with some equal parts")
+    _log.info("weights of %s: %d of %d arrays are used", path, len(same), len(found))
+    left = {
+        "of another shape, which are initialized": wanted.keys()
+        & (found.keys() - same),
+        "only in this model, which are initialized": wanted.keys() - found.keys(),
+        "only in that model, which are not used": found.keys() - wanted.keys(),
+    }
+    for kind, names in left.items():
+        if names := {name for name in names if not name.startswith(own)}:
+            parts = sorted({name.rpartition("/")[0] for name in names})
+            _log.info("%d arrays are %s: %s", len(names), kind, ", ".join(parts))
+    part: VariableDict = unflatten_dict(same, sep="/")
+    return part

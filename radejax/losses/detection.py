@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 import jax
 import jax.numpy as jnp
 import pydantic
 from flax.core import freeze
-from jaxtyping import Bool, Float, Int, Num
+from jaxtyping import Bool, Float, Int, Num, Shaped
 
 from radejax.core.errors import require
-from radejax.core.options import NotNegative, Options, Positive, find_part
+from radejax.core.options import NotNegative, Options, Positive, find_function
 from radejax.core.structures import Batch, DetectionMaps
 from radejax.detection.decode import DecodeOptions, find_peaks, suppress
 from radejax.detection.nms import match_boxes
@@ -88,7 +89,7 @@ class LossOptions(Options, section="config.loss"):
         terms = dict(LOSSES)
         for place in self.own_terms:
             name = place.partition(":")[2]
-            terms[name] = find_part(place, "config.loss.own_terms", {})
+            terms[name] = find_function(place, "config.loss.own_terms")
         return terms
 
 
@@ -106,7 +107,8 @@ def detection_loss(
 
     Args:
         maps: Predictions, `[B, R, A, C]` logits and `[B, R, A, 8]` box parameters.
-        batch: Ground truth, of which `boxes`, `classes` and `is_valid` are used.
+        batch: Ground truth, of which `boxes`, `classes`, `is_valid` and `targets` are
+            used; own terms may use all of it.
         grid: The grid of the maps, padded if they are.
         options: Options of the loss; the defaults are the paper's except for `assignment`.
         decoding: Thresholds of peaks and NMS for the assignment "nms", which should be
@@ -152,17 +154,18 @@ def detection_loss(
     )
     # The bins of the predictions that are compared, their objects, and a mask of those
     # that have one.
+    truth = {"boxes": boxes}
+    truth |= {name: jnp.asarray(x) for name, x in batch.targets.items()}
     if options.assignment == "center":
         bins = grid.nearest_bin(boxes[..., 0], boxes[..., 1])  # [B, N, 2]
-        expected = boxes
         is_matched = is_valid
     else:
-        bins, expected, is_matched = _after_nms(
+        bins, object_idx, is_matched = _after_nms(
             decoding or DecodeOptions(), maps, boxes, is_valid, grid
         )
-    # A gather per frame needs no communication if the batch is sharded over devices.
-    params = jax.vmap(lambda map, at: map[at[:, 0], at[:, 1]])(maps.box_params, bins)
-    predicted = grid.boxes_at(params, bins)
+        truth = {name: _rows_at(x, object_idx) for name, x in truth.items()}
+    expected = truth.pop("boxes")
+    predicted = grid.boxes_at(_at_bins(maps.box_params, bins), bins)
     row = is_matched[..., None]
     pairs = Pairs(
         maps.heatmap_logits,
@@ -172,6 +175,14 @@ def detection_loss(
         jnp.where(row, predicted, 1.0),
         jnp.where(row, expected, 1.0),
         is_matched,
+        outputs={name: _at_bins(x, bins) for name, x in maps.outputs.items()},
+        targets={name: jnp.nan_to_num(x) for name, x in truth.items()},
+        is_known={
+            name: is_matched & jnp.isfinite(x).reshape(*is_matched.shape, -1).all(-1)
+            for name, x in truth.items()
+        },
+        maps=maps,
+        batch=batch,
     )
     functions = options.find_terms()
     terms = {name: functions[name](pairs, options) for name in options.weights}
@@ -182,11 +193,29 @@ def detection_loss(
     return total, terms
 
 
+# A gather per frame needs no communication if the batch is sharded over devices.
+@jax.vmap
+def _at_bins(
+    values: Shaped[jax.Array, "R A ..."], bins: Int[jax.Array, "K 2"]
+) -> Shaped[jax.Array, "K ..."]:
+    """Returns the values of every frame at bins: `[B, R, A, ...]` -> `[B, K, ...]`."""
+    return values[bins[:, 0], bins[:, 1]]
+
+
+@jax.vmap
+def _rows_at(
+    rows: Shaped[jax.Array, "N ..."], indices: Int[jax.Array, " K"]
+) -> Shaped[jax.Array, "K ..."]:
+    """Returns rows of every frame: `[B, N, ...]` at `[B, K]` -> `[B, K, ...]`."""
+    return rows[indices]
+
+
 # Terms -------------------------------------------------------------------------------
 
 
-class Pairs(NamedTuple):
-    """Predictions and their targets.
+@dataclasses.dataclass(frozen=True)
+class Pairs:
+    """Predictions and their targets, which the loss terms compare.
 
     Attributes:
         logits: `[B, R, A, C]` heatmap logits.
@@ -195,6 +224,14 @@ class Pairs(NamedTuple):
             peaks for the assignment "nms".
         expected: `[B, N, 8]` boxes of the matched objects.
         is_matched: `[B, N]` bool, True where a predicted box is matched with an object.
+        outputs: `[B, N, ...]` further outputs of the model at the predicted boxes' bins, by
+            name, see `config.model.outputs`.
+        targets: `[B, N, ...]` columns of the matched objects by name, see
+            `config.data.targets`; 0 where they are not known.
+        is_known: `[B, N]` bool by name, True where a matched object has all values of a
+            target.
+        maps: All predictions.
+        batch: Whole ground truth and inputs.
     """
 
     logits: Maps
@@ -202,11 +239,24 @@ class Pairs(NamedTuple):
     predicted: Boxes8
     expected: Boxes8
     is_matched: Mask
+    outputs: Mapping[str, jax.Array]
+    targets: Mapping[str, jax.Array]
+    is_known: Mapping[str, Mask]
+    maps: DetectionMaps
+    batch: Batch
 
-    def mean(self, values: Float[jax.Array, "B N"]) -> Float[jax.Array, ""]:
-        """Averages `[B, N]` values over the matched boxes of each frame, then over frames."""
-        total = jnp.sum(jnp.where(self.is_matched, values, 0.0), axis=1)
-        return jnp.mean(total / jnp.maximum(jnp.sum(self.is_matched, axis=1), 1))
+    def mean(
+        self, values: Float[jax.Array, "B N"], where: Mask | None = None
+    ) -> Float[jax.Array, ""]:
+        """Averages values over the matched boxes of each frame, then over frames.
+
+        Args:
+            values: `[B, N]` values.
+            where: `[B, N]` mask of the boxes that count; `is_matched` if None.
+        """
+        counts = self.is_matched if where is None else where
+        total = jnp.sum(jnp.where(counts, values, 0.0), axis=1)
+        return jnp.mean(total / jnp.maximum(jnp.sum(counts, axis=1), 1))
 
 
 def _focal(pairs: Pairs, _: LossOptions) -> Float[jax.Array, ""]:
@@ -278,11 +328,11 @@ def _after_nms(
     boxes: Boxes8,
     is_valid: Mask,
     grid: RadarGrid,
-) -> tuple[Int[jax.Array, "B K 2"], Float[jax.Array, "B K 8"], Bool[jax.Array, "B K"]]:
+) -> tuple[Int[jax.Array, "B K 2"], Int[jax.Array, "B K"], Bool[jax.Array, "B K"]]:
     """Assigns to each prediction that survives NMS the object that it overlaps most.
 
     Returns:
-        Bins of K peaks, their objects, and a mask of the peaks that have one.
+        Bins of K peaks, the indices of their objects, and a mask of the peaks that have one.
     """
     # The selection of boxes is not differentiable.
     peaks = find_peaks(
@@ -295,5 +345,4 @@ def _after_nms(
     keep = suppress(peaks, decoding.nms_iou, per_class=decoding.per_class_nms)
     match = jax.vmap(match_boxes)
     object_idx, is_matched = match(peaks.boxes, keep, boxes, is_valid)
-    expected = jax.vmap(lambda boxes, idx: boxes[idx])(boxes, object_idx)
-    return peaks.bins, expected, is_matched
+    return peaks.bins, object_idx, is_matched

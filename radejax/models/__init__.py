@@ -10,7 +10,7 @@ import flax.linen as nn
 from radejax.core.errors import UserError, require
 from radejax.core.options import find_part
 from radejax.geometry.radar_grid import AzimuthMapping, RadarGrid
-from radejax.models.dinorade import DinoRade
+from radejax.models.dinorade import IMAGE_BACKBONE, DinoRade
 from radejax.models.options import RadeNetOptions
 from radejax.models.radenet import RadeNet
 
@@ -66,6 +66,15 @@ def _model_class(name: str) -> type[RadeNet]:
 def has_camera(model: nn.Module) -> typing.TypeGuard[DinoRade]:
     """Returns whether a model takes images."""
     return isinstance(model, DinoRade)
+
+
+def external_parts(model: nn.Module) -> tuple[str, ...]:
+    """Returns the parts whose frozen parameters are in a file of their own.
+
+    Checkpoints do not contain them.
+    """
+    is_external = has_camera(model) and model.options.image.freeze
+    return (IMAGE_BACKBONE,) if is_external else ()
 
 
 def map_grid(

@@ -11,9 +11,10 @@ References:
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import flax.linen as nn
 
@@ -128,11 +129,13 @@ class Heads(layers.Part):
         dtype: Dtype of the computation up to the last convolution.
         heatmap_prior: Approximate score of every bin in an untrained model, 0.5 in the
             released code. A lower value (0.1 in CenterNet) suits mostly empty scenes.
+        outputs: Names and channels of further heads.
     """
 
     num_classes: int
     kind: str = "expanded"
     heatmap_prior: float = 0.5
+    outputs: Mapping[str, int] = dataclasses.field(default_factory=dict)
 
     @nn.compact
     def __call__(self, x: Map) -> DetectionMaps:
@@ -144,4 +147,6 @@ class Heads(layers.Part):
         )
         logit = math.log(self.heatmap_prior / (1.0 - self.heatmap_prior))
         heatmap = head(self.num_classes, initial_bias=logit, name="heatmap")
-        return DetectionMaps(heatmap(x), head(NUM_BOX_PARAMS, name="box")(x))
+        box = head(NUM_BOX_PARAMS, name="box")
+        others = {name: head(size, name=name)(x) for name, size in self.outputs.items()}
+        return DetectionMaps(heatmap(x), box(x), others)

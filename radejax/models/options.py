@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import types
+from collections.abc import Mapping
 from typing import Annotated, Literal, Self
 
 import numpy as np
 import pydantic
 from annotated_types import Ge, Gt, Le, Lt, MinLen
+from flax.core import freeze
 from jaxtyping import Float
 
 from radejax.core.errors import require
 from radejax.core.options import BelowOne, Options, Positive, Size, find_part
-from radejax.core.structures import CLASSES, Array
+from radejax.core.structures import BOX_FIELDS, CLASSES, Array
 from radejax.geometry.radar_grid import RadarGrid, is_uniform, values_at
 from radejax.models.backbone import BACKBONES, Backbone, CBAMKind
 from radejax.models.heads import HEADS, NECKS, Head, Neck
@@ -23,6 +25,9 @@ WeightingKind = Literal["mlp", "cnn", "off"]
 OutOfViewRule = Literal["drop", "official"]
 Bins = Annotated[int, Ge(0), Le(1 << 16)]
 Axis = Annotated[tuple[float, ...], MinLen(2)]
+
+_TAKEN = {"heatmap", "box", "frame", "cls", "score", *BOX_FIELDS}
+"""Names of heads, and columns of boxes."""
 
 MARGIN_PX = 280
 """Columns at the left and right border that `out_of_view="official"` treats as out of view.
@@ -78,6 +83,13 @@ class RadeNetOptions(Options, section="config.model"):
     """Multiplied with the projection after the subtraction, above 0; 1 in the paper. An echo
     10 dB above the noise differs from it by 0.054, and with a factor of 20 by 1.1, which is a
     usual magnitude of a network's input."""
+    outputs: Annotated[
+        Mapping[str, Size],
+        pydantic.AfterValidator(freeze),
+        pydantic.PlainSerializer(dict),
+    ] = freeze({})
+    """Further outputs per bin, by name, and their channels, such as {"velocity": 2}. Each
+    has a head of its own."""
 
     @pydantic.model_validator(mode="after")
     def _check_radenet(self) -> Self:
@@ -102,6 +114,9 @@ class RadeNetOptions(Options, section="config.model"):
         for name, width in widths.items():
             is_multiple = width > 0 and width % self.num_groups == 0
             require(is_multiple, f"config.model.{name}", width, expected)
+        expected = f"names other than {', '.join(sorted(_TAKEN))}"
+        is_new = _TAKEN.isdisjoint(self.outputs)
+        require(is_new, "config.model.outputs", dict(self.outputs), expected)
         return self
 
 

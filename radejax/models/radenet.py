@@ -103,6 +103,7 @@ class RadeNet(nn.Module):
             num_classes=options.num_classes,
             kind=options.heads,
             heatmap_prior=options.heatmap_prior,
+            outputs=options.outputs,
             **self._shared(),
             name="heads",
         )

@@ -17,6 +17,7 @@ from radejax.config import Config, check_bins
 from radejax.core import devices
 from radejax.core.errors import UserError, require
 from radejax.core.files import as_path
+from radejax.core.options import find_function
 from radejax.core.structures import Batch
 from radejax.data import cameras, pipeline, records
 from radejax.data.augment import Augmentation
@@ -231,6 +232,7 @@ class Data:
             classes=self.classes,
             images=images,
             num_frames=options.num_frames,
+            targets=options.targets,
         )
         count = options.num_frames
         is_useful = count == 1 or any(len(set(keys)) > 1 for keys in table.keys)
@@ -239,9 +241,17 @@ class Data:
         if (shuffled := options.label_permutation_seed) is not None:
             order = np.random.default_rng(shuffled).permutation(len(table))
             table = dataclasses.replace(
-                table, boxes=table.boxes[order], classes=table.classes[order]
+                table,
+                boxes=table.boxes[order],
+                classes=table.classes[order],
+                targets={name: x[order] for name, x in table.targets.items()},
             )
-        augment = Augmentation(self.records.grid, options.mirror_probability)
+        name = "config.data.augmentation"
+        augment = Augmentation(
+            self.records.grid,
+            options.mirror_probability,
+            [find_function(place, name) for place in options.augmentation],
+        )
         size = train.batch_size // jax.process_count()
         loader = pipeline.LoaderOptions(size, seed, num_threads=options.num_threads)
         return pipeline.make_loader(table, loader, augment=augment)

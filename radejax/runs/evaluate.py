@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import logging
 import math
 import pathlib
@@ -22,6 +23,7 @@ from radejax.core.structures import Boxes
 from radejax.data.cameras import require_images
 from radejax.data.dataset import FrameSequence, LabelledFrame, find_reader
 from radejax.data.projection import decode
+from radejax.evaluation.analysis import box_errors
 from radejax.evaluation.boxes import roi_bounds, tables_from_frames
 from radejax.evaluation.evaluation_set import Result
 from radejax.evaluation.report import STALE, Report, write_report
@@ -84,7 +86,9 @@ class Evaluation:
         if shuffle_images is not None:
             self._seen = with_shuffled_images(data, split, shuffle_images)
         self._images = data.images(self._seen)
-        self._truth, self._table = tables_from_frames(self._frames, split)
+        self._truth, self._table = tables_from_frames(
+            self._frames, split, config.data.targets
+        )
         saved = SavedModel(config, data.records.grid, {})
         mesh = devices.make_mesh() if mesh is None else mesh
         placement = devices.batch_sharding(mesh)
@@ -136,6 +140,11 @@ class Evaluation:
         shown = self._spread(self._config.logging.num_visualizations)
         drawn = devices.main_only(lambda: dict(self._figures(predictions, shown)))
         values = {f"validation/{name}": ap for name, ap in aps.items()}
+        if metrics := self._options.find_metrics():
+            errors = box_errors(data, self._options.iou_thresholds[0], metrics)
+            for name, cls in itertools.product(metrics, errors):
+                median = errors[cls][f"{name}_median"]
+                values[f"validation/{name}_median/{cls}"] = median
         named = {f"validation/{name}": figure for name, figure in (drawn or {}).items()}
         return Scores(values, None if math.isnan(best) else best, named)
 

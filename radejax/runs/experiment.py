@@ -39,13 +39,18 @@ from radejax.config import Config
 from radejax.core import devices, files
 from radejax.core.errors import UserError, require
 from radejax.core.files import JsonObject, PathLike
+from radejax.core.options import find_function
 from radejax.core.structures import Batch
 from radejax.core.version import __version__
 from radejax.data.dataset import FrameSequence
 from radejax.data.records import open_embeddings
 from radejax.evaluation.report import Table, number, numbers, write_tables
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.inference.saved import FROZEN_BACKBONE, starting_weights
+from radejax.inference.saved import (
+    FROZEN_BACKBONE,
+    matching_weights,
+    starting_weights,
+)
 from radejax.runs.data import located, open_data
 from radejax.runs.evaluate import Evaluation, named_aps
 from radejax.training import hooks, loop
@@ -55,12 +60,15 @@ from radejax.training.metric_writer import MetricWriter, Scores, log_results
 from radejax.training.step import (
     Metrics,
     TrainState,
+    check_patterns,
     count_steps,
     create_state,
+    freezing,
     initial_variables,
     make_optimizer,
     make_schedule,
     make_train_step,
+    with_pretrained,
 )
 from radejax.weights.image_backbone import check_fits
 
@@ -72,6 +80,7 @@ def run(
     workdir: PathLike,
     *,
     init_from: PathLike | None = None,
+    init_partial: PathLike | None = None,
     profile: PathLike | None = None,
     mesh: Mesh | None = None,
 ) -> pathlib.Path:
@@ -82,6 +91,8 @@ def run(
         workdir: Folder of the run, created if missing.
         init_from: Weights to start from: an official checkpoint file, another workdir, or
             another model that `load_model` accepts.
+        init_partial: Model whose weights are used where name and shape are equal, see
+            `matching_weights`, instead of `init_from`.
         profile: Folder for a profiler trace of the steps `config.logging.profile_steps`;
             None for no trace.
         mesh: Devices of the run, see `make_mesh`; all if None.
@@ -112,6 +123,12 @@ def run(
     )
     if variables is not None:
         check_fits(model, variables, str(init_from))
+    if init_partial is not None:
+        require(
+            init_from is None, "--init-from", init_from, "none, or no --init-partial"
+        )
+        part = matching_weights(init_partial, model)
+        pretrained = with_pretrained(part, pretrained or {})
 
     with claimed(folder, config):
         # Data -------------------------------------------------------------------------
@@ -125,7 +142,8 @@ def run(
                 "no frames of the test split in %s: the run is trained and not evaluated",
                 ", ".join(data.options.roots),
             )
-        info = run_info(folder, init_from) | {"input": data.usual_input}
+        info = run_info(folder, init_from, init_partial)
+        info["input"] = data.usual_input
         if devices.is_main():
             files.write_json(folder / "run.json", info)
         training_data = TrainingData(
@@ -276,7 +294,8 @@ def fit(
         timed_batches = hooks.Throughput(data.batches, start)
         log = hooks.Log(config, data.steps_per_epoch, timed_batches, writer, bar)
         check = hooks.CheckSkipped(config.train.max_skipped_steps)
-        save = hooks.Save(checkpoints, data.batches, data.info, check, start)
+        external = models.external_parts(model)
+        save = hooks.Save(checkpoints, data.batches, data.info, check, external, start)
         due = functools.partial(hooks.every, num_steps)
         log_every_steps = config.train.log_every_steps
         called: list[Hook] = [timed_batches, bar, due(log_every_steps, log)]
@@ -294,6 +313,9 @@ def fit(
 
             epochs = config.train.evaluate_every_epochs
             called.append(due(epochs * data.steps_per_epoch, evaluate))
+        for place in config.train.hooks:
+            own: hooks.OwnHook = find_function(place, "config.train.hooks")
+            called.append(hooks.logged(own, writer))
         called.append(due(log_every_steps, check))
         called.append(due(config.train.checkpoint_every_steps, save))
         if profile is not None:
@@ -327,10 +349,11 @@ def _make_state_and_step(
     """Restores or initializes the state, and returns it with the function of a step."""
     train = config.train
     use_ema = train.ema_decay is not None
-    is_frozen = getattr(model, "is_frozen", None)
+    is_frozen = freezing(model, train.freeze)
     optimizer = make_optimizer(train, make_schedule(train, data.steps_per_epoch))
 
     def create(variables: VariableDict) -> TrainState:
+        check_patterns(variables["params"], train.freeze)
         return create_state(variables, optimizer, use_ema=use_ema, is_frozen=is_frozen)
 
     def place(state: TrainState) -> PyTree[NamedSharding]:
@@ -343,6 +366,7 @@ def _make_state_and_step(
         create,
         place,
         data.info.get("same", {}),
+        models.external_parts(model),
     )
     step = make_train_step(
         model,
@@ -362,6 +386,7 @@ _MAY_CHANGE = (
     "train.checkpoint_every_steps",
     "train.checkpoints_to_keep",
     "train.evaluate_every_epochs",
+    "train.hooks",
     "train.log_every_steps",
     "train.max_skipped_steps",
     "train.max_steps",
@@ -407,21 +432,29 @@ def claimed(workdir: pathlib.Path, config: Config) -> Iterator[None]:
         yield
 
 
-def run_info(workdir: pathlib.Path, init_from: PathLike | None = None) -> JsonObject:
+def run_info(
+    workdir: pathlib.Path,
+    init_from: PathLike | None = None,
+    init_partial: PathLike | None = None,
+) -> JsonObject:
     """Returns the versions, device, command and starting weights of a run as plain values.
 
     Args:
         workdir: Workdir of the run.
         init_from: Weights that the run starts from. If None, the entry of an existing
             `run.json` is kept.
+        init_partial: Model whose weights are used where they match; as `init_from`.
     """
-    if init_from is not None:
-        init_from = str(files.as_path(init_from).absolute())
-    elif (workdir / "run.json").exists():
-        init_from = files.read_object(workdir / "run.json").get("init_from")
+    path = workdir / "run.json"
+    before = files.read_object(path) if path.exists() else {}
+    given = {"init_from": init_from, "init_partial": init_partial}
+    start = {
+        name: before.get(name) if one is None else str(files.as_path(one).absolute())
+        for name, one in given.items()
+    }
     versions = {"radejax": __version__, "jax": jax.__version__}
     return {
-        "init_from": init_from,
+        **start,
         "versions": {**versions, "python": sys.version.split()[0]},
         "device": str(jax.devices()[0].device_kind),
         "command": shlex.join(sys.argv),

@@ -41,7 +41,7 @@ _log = logging.getLogger(__name__)
 T = TypeVar("T")
 
 _BEST = "best"  # name of the metric that decides which checkpoint is best
-_VARIABLES = ("params", "ema_params", "model_state")
+_VARIABLES = ("params", "ema_params", "model_state", "frozen")
 
 
 @contextlib.contextmanager
@@ -216,9 +216,9 @@ class Checkpoints:
             step: Step of the checkpoint; the newest if None.
 
         Returns:
-            A dictionary with `params`, `ema_params` and `model_state` as nested
-            dictionaries of NumPy arrays, or None where the checkpoint has none; the
-            `info` saved with them; and the step.
+            A dictionary with `params`, `ema_params`, `model_state` and `frozen` as
+            nested dictionaries of NumPy arrays, or None where the checkpoint has none;
+            the `info` saved with them; and the step.
 
         Raises:
             FileNotFoundError: There is no checkpoint, or none of that step.

@@ -11,7 +11,7 @@ import contextlib
 import dataclasses
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import grain
 import jax
@@ -31,6 +31,9 @@ _log = logging.getLogger(__name__)
 
 Hook = Callable[[int, TrainState, Metrics], None]
 
+OwnHook = Callable[[int, TrainState, Metrics], Mapping[str, float] | None]
+"""Function of `config.train.hooks`, which may return values to be logged."""
+
 
 def every(num_steps: int, count: int, hook: Hook) -> Hook:
     """Returns a hook that calls another one every `count` steps and after the last step.
@@ -41,6 +44,16 @@ def every(num_steps: int, count: int, hook: Hook) -> Hook:
     def call(step: int, state: TrainState, metrics: Metrics) -> None:
         if count and (step % count == 0 or step == num_steps):
             hook(step, state, metrics)
+
+    return call
+
+
+def logged(hook: OwnHook, writer: MetricWriter) -> Hook:
+    """Returns a hook that writes the values that another one returns, if there are any."""
+
+    def call(step: int, state: TrainState, metrics: Metrics) -> None:
+        if values := hook(step, state, metrics):
+            writer.write(step, {name: float(x) for name, x in values.items()})
 
     return call
 
@@ -204,6 +217,7 @@ class Save:
         batches: Iterator whose next batch belongs to the saved state.
         info: Plain values that are saved with each state.
         check: Hook that is called before a state is saved.
+        external: Parts of the model whose frozen parameters are not saved.
         saved_step: Step of the state that was saved or restored last.
     """
 
@@ -211,6 +225,7 @@ class Save:
     batches: grain.DatasetIterator[Batch]
     info: Mapping[str, object]
     check: Hook
+    external: Sequence[str]
     saved_step: int
 
     def __call__(
@@ -232,7 +247,7 @@ class Save:
         if step == self.saved_step:
             return
         self.check(step, state, metrics)
-        kept = state.replace(frozen={})
+        kept = state.without(self.external)
         self.checkpoints.save(step, kept, self.batches, info=self.info, best=best)
         self.saved_step = step
 

@@ -103,6 +103,7 @@ def restore_or_initialize(
     create: Callable[[VariableDict], TrainState],
     place: Callable[[TrainState], PyTree],
     same: Mapping[str, object],
+    external: Sequence[str] = (),
 ) -> TrainState:
     """Restores the state of the newest checkpoint, or creates the state of step 0.
 
@@ -113,6 +114,7 @@ def restore_or_initialize(
         create: Function that creates the state of step 0 from them.
         place: Function from the shapes of the state to its shardings.
         same: Plain values by name that must equal those in the checkpoint.
+        external: Parts of the model whose frozen parameters are not in checkpoints.
 
     Raises:
         DataError: There are checkpoints, but none can be restored.
@@ -122,7 +124,7 @@ def restore_or_initialize(
     abstract = jax.eval_shape(create, shapes)
     placement = place(abstract)
     wanted = jax.tree.map(lambda x, s: x.update(sharding=s), abstract, placement)
-    restored = checkpoints.restore(wanted.replace(frozen={}), batches)
+    restored = checkpoints.restore(wanted.without(external), batches)
     if restored is None:
         created = jax.jit(create, out_shardings=placement)(_evaluate(traced, shapes))
         # `jax_disable_jit` ignores `out_shardings`.
@@ -136,9 +138,13 @@ def restore_or_initialize(
             f"{'; '.join(lines)}; give the same, or another --workdir"
         )
     _log.info("continuing from step %d", step)
-    if abstract.frozen:  # checkpoints do not contain frozen parameters
-        frozen = jax.jit(lambda x: create(x).frozen, out_shardings=placement.frozen)
-        state = state.replace(frozen=frozen(_evaluate(traced, shapes)))
+    if missing := [name for name in external if name in abstract.frozen]:
+        computed = jax.jit(
+            lambda x: {name: create(x).frozen[name] for name in missing},
+            out_shardings={name: placement.frozen[name] for name in missing},
+        )
+        frozen = {**state.frozen, **computed(_evaluate(traced, shapes))}
+        state = state.replace(frozen=frozen)
     return state
 
 

@@ -26,15 +26,20 @@ class TrainOptions(Options, section="config.train"):
     """Passes over the training data, unless `max_steps` is given."""
     max_steps: AtLeastOne | None = None
     """Steps of the training, however many epochs they take. None: those of `num_epochs`."""
+    optimizer: str = "adamw"
+    """adamw (with torch's defaults, as in the paper) or module:function."""
     learning_rate: Positive = 1e-3
-    """Peak learning rate of AdamW."""
+    """Peak learning rate."""
     final_learning_rate: NotNegative = 1e-4
     """Final learning rate, at most the peak."""
-    schedule: Literal["cosine", "cyclic_cosine"] = "cosine"
-    """Learning rate per step: cosine (decreases once, over the training) or
-    cyclic_cosine (decreases in one epoch and increases in the next, as released)."""
+    schedule: str = "cosine"
+    """Learning rate per step: cosine (decreases once, over the training), cyclic_cosine
+    (decreases in one epoch and increases in the next, as released) or module:function."""
     weight_decay: NotNegative = 0.01
     """Weight decay on every parameter."""
+    freeze: tuple[str, ...] = ()
+    """Parameters that are not trained: patterns of their paths, such as
+    "backbone/encoder*"; empty: none but those that the model freezes."""
     warmup_steps: Count = 0
     """Steps of a linear warm-up from 0; fewer than the steps of the training."""
     gradient_clip_norm: Positive | None = None
@@ -60,6 +65,8 @@ class TrainOptions(Options, section="config.train"):
     max_skipped_steps: Count = 20
     """The run stops after more than this number of consecutive steps whose loss or
     gradient is not finite."""
+    hooks: tuple[str, ...] = ()
+    """Functions module:function that are called after every step."""
 
     @pydantic.model_validator(mode="after")
     def _check(self) -> TrainOptions:

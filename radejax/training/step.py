@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import fnmatch
+from collections.abc import Callable, Iterable, Sequence
 
 import chex
 import flax.linen as nn
@@ -17,6 +18,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Float, Int, Num, PyTree
 
 from radejax.core.errors import UserError, require
+from radejax.core.options import find_function
 from radejax.core.structures import Batch
 from radejax.detection.decode import DecodeOptions
 from radejax.geometry.radar_grid import RadarGrid
@@ -45,78 +47,118 @@ def count_steps(train: TrainOptions, steps_per_epoch: int) -> int:
 
 
 def make_schedule(train: TrainOptions, steps_per_epoch: int) -> optax.Schedule:
-    """Linear warm-up from zero, then a cosine between the peak and the minimum.
+    """Returns the schedule that `config.train.schedule` names.
 
     RADE-Net section IV-B uses a cosine per step from 1e-3 to 1e-4 without warm-up.
 
     Args:
-        train: The section `config.train`. With the `schedule` "cosine", the learning rate
-            decreases once, over the training. With "cyclic_cosine", as in the released
-            code, it decreases in one epoch, increases in the next, and so on: this is
-            torch's `CosineAnnealingLR` with `T_max = steps_per_epoch`, stepped per batch.
+        train: The section `config.train`. An own schedule is a function that is called
+            as those in `SCHEDULES`.
         steps_per_epoch: Number of batches of one pass over the data.
 
     Returns:
         Function from the step to the float32 learning rate.
 
     Raises:
-        UserError: The warm-up is not shorter than the training.
+        UserError: The warm-up is not shorter than the training, or there is no such
+            schedule.
     """
-    peak = train.learning_rate
-    minimum = train.final_learning_rate
     warmup_steps = train.warmup_steps
     num_steps = count_steps(train, steps_per_epoch)
     expected = f"less than the {num_steps} steps of the training"
     is_shorter = warmup_steps < num_steps
     require(is_shorter, "config.train.warmup_steps", warmup_steps, expected)
-    if train.schedule == "cosine":
-        return optax.warmup_cosine_decay_schedule(
-            0.0, peak, warmup_steps, num_steps, minimum
-        )
-    warmup = optax.linear_schedule(0.0, peak, warmup_steps)
-    cyclic = _cyclic_cosine(peak, minimum, steps_per_epoch)
-    return optax.join_schedules([warmup, cyclic], [warmup_steps])
+    make = find_function(train.schedule, "config.train.schedule", SCHEDULES)
+    return make(train, num_steps, steps_per_epoch)
 
 
-def _cyclic_cosine(peak: float, minimum: float, half_period: int) -> optax.Schedule:
-    """Returns the closed form of torch's recursion.
+def _cosine(train: TrainOptions, num_steps: int, _: int) -> optax.Schedule:
+    """Linear warm-up from zero, then half a cosine from the peak to the minimum."""
+    return optax.warmup_cosine_decay_schedule(
+        0.0,
+        train.learning_rate,
+        train.warmup_steps,
+        num_steps,
+        train.final_learning_rate,
+    )
 
-    The rate is minimum + (peak - minimum) cos^2(pi t / 2T). It is computed from the whole
-    number of steps to the nearest minimum, which keeps the float32 precision where the
-    rate is small and after any number of epochs.
+
+def _cyclic_cosine(train: TrainOptions, _: int, steps_per_epoch: int) -> optax.Schedule:
+    """Linear warm-up from zero, then the schedule of the released code.
+
+    The rate decreases in one epoch, increases in the next, and so on: this is torch's
+    `CosineAnnealingLR` with `T_max = steps_per_epoch`, stepped per batch. Its closed form
+    is minimum + (peak - minimum) cos^2(pi t / 2T). It is computed from the whole number of
+    steps to the nearest minimum, which keeps the float32 precision where the rate is small
+    and after any number of epochs.
     """
+    peak = train.learning_rate
+    minimum = train.final_learning_rate
+    half_period = steps_per_epoch
 
     def rate(step: ArrayLike) -> Float[jax.Array, "..."]:
         from_floor = jnp.abs(jnp.mod(step, 2 * half_period) - half_period)
         angle = jnp.asarray(from_floor, jnp.float32) * (jnp.pi / (2 * half_period))
         return minimum + (peak - minimum) * jnp.square(jnp.sin(angle))
 
-    return rate
+    warmup = optax.linear_schedule(0.0, peak, train.warmup_steps)
+    return optax.join_schedules([warmup, rate], [train.warmup_steps])
+
+
+SCHEDULES: dict[str, Callable[[TrainOptions, int, int], optax.Schedule]] = {
+    "cosine": _cosine,
+    "cyclic_cosine": _cyclic_cosine,
+}
+"""Schedules by their name in `config.train.schedule`: functions of the section
+`config.train`, the steps of the training, and the steps of an epoch."""
 
 
 def make_optimizer(
     train: TrainOptions, schedule: optax.Schedule
 ) -> optax.GradientTransformation:
-    """Creates AdamW with torch's defaults and weight decay on every parameter.
+    """Creates the optimizer that `config.train.optimizer` names.
 
     The mean gradient of `gradient_accumulation_steps` steps updates the parameters, see
     `optax.MultiSteps`. It is clipped to the global norm `gradient_clip_norm` unless this
     is None.
 
     Args:
-        train: The section `config.train`.
+        train: The section `config.train`. An own optimizer is a function that is called
+            as those in `OPTIMIZERS`.
         schedule: Function from the step to the learning rate.
+
+    Raises:
+        UserError: There is no such optimizer.
     """
     count = train.gradient_accumulation_steps
+    name = "config.train.optimizer"
+    make = find_function(train.optimizer, name, OPTIMIZERS)
     # The optimizer counts updates, while the schedule takes steps.
-    adamw = optax.adamw(lambda n: schedule(n * count), weight_decay=train.weight_decay)
-    parts: list[optax.GradientTransformation] = [adamw]
+    base = make(train, lambda n: schedule(n * count))
+    is_optimizer = isinstance(base, optax.GradientTransformation)
+    expected = "a function that returns an optax.GradientTransformation"
+    require(is_optimizer, name, train.optimizer, expected)
+    parts: list[optax.GradientTransformation] = [base]
     if train.gradient_clip_norm is not None:
         parts.insert(0, optax.clip_by_global_norm(train.gradient_clip_norm))
     optimizer: optax.GradientTransformation = optax.chain(*parts)
     if count > 1:
         return optax.MultiSteps(optimizer, count).gradient_transformation()
     return optimizer
+
+
+def _adamw(
+    train: TrainOptions, schedule: optax.Schedule
+) -> optax.GradientTransformation:
+    """AdamW with torch's defaults and weight decay on every parameter."""
+    return optax.adamw(schedule, weight_decay=train.weight_decay)
+
+
+OPTIMIZERS: dict[
+    str, Callable[[TrainOptions, optax.Schedule], optax.GradientTransformation]
+] = {"adamw": _adamw}
+"""Optimizers by their name in `config.train.optimizer`: functions of the section
+`config.train`, and of the schedule of the learning rate."""
 
 
 # State -------------------------------------------------------------------------------
@@ -134,7 +176,7 @@ class TrainState(struct.PyTreeNode):
         opt_state: State of the optimizer.
         ema_params: Moving average of `params`, or None.
         frozen: Parameters that are not trained. They have no gradient, optimizer state
-            or average, and are not saved in checkpoints.
+            or average.
     """
 
     step: Int[jax.Array, ""]
@@ -151,6 +193,11 @@ class TrainState(struct.PyTreeNode):
         """Variables for evaluation, with the averaged parameters if there are any."""
         params = self.params if self.ema_params is None else self.ema_params
         return {"params": merge_parameters(params, self.frozen), **self.model_state}
+
+    def without(self, parts: Iterable[str]) -> TrainState:
+        """Returns the state without the frozen parameters of parts of the model."""
+        kept = {name: x for name, x in self.frozen.items() if name not in set(parts)}
+        return self.replace(frozen=kept)
 
 
 def create_state(
@@ -180,6 +227,36 @@ def create_state(
         ema_params=jax.tree.map(jnp.copy, params) if use_ema else None,
         frozen=frozen,
     )
+
+
+def freezing(model: nn.Module, patterns: Sequence[str]) -> Callable[[str], bool]:
+    """Returns the function from the path of a parameter to whether it is not trained.
+
+    Args:
+        model: Model, which may have a method `is_frozen` of the same kind.
+        patterns: Patterns of further parameters, such as "backbone/encoder*".
+    """
+    own = getattr(model, "is_frozen", None)
+
+    def is_frozen(path: str) -> bool:
+        is_own = own is not None and own(path)
+        return is_own or any(fnmatch.fnmatchcase(path, one) for one in patterns)
+
+    return is_frozen
+
+
+def check_patterns(params: Collection, patterns: Sequence[str]) -> None:
+    """Raises `UserError` if one of `config.train.freeze` matches no parameter, or all match."""
+    paths = list(flatten_dict(params, sep="/"))
+    examples = ", ".join(sorted({path.rpartition("/")[0] for path in paths})[:8])
+    left = set(paths)
+    for pattern in patterns:
+        found = fnmatch.filter(paths, pattern)
+        expected = f"a pattern of paths of parameters, which are in {examples}, ..."
+        require(len(found) > 0, "config.train.freeze", pattern, expected)
+        left.difference_update(found)
+    expected = "patterns that leave parameters to train"
+    require(len(left) > 0, "config.train.freeze", patterns, expected)
 
 
 def split_parameters(
