@@ -13,7 +13,7 @@ import importlib.util
 import os
 import pathlib
 import types
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from typing import Annotated, Any
 
 import pydantic
@@ -40,15 +40,9 @@ from radejax.losses.detection import LossOptions
 from radejax.models.options import RadeNetOptions
 from radejax.simulation.config import SimulationOptions
 from radejax.training.options import LoggingOptions, TrainOptions
-from radejax.training.step import OPTIMIZERS, SCHEDULES
 
 CONFIGS = pathlib.Path(__file__).resolve().parent / "configs"
 """Folder of the bundled configs; in a checkout, a link to the one next to the package."""
-
-_TRAINING_PARTS: dict[str, Mapping[str, Callable[..., object]]] = {
-    "optimizer": OPTIMIZERS,
-    "schedule": SCHEDULES,
-}
 
 
 class Config(Options):
@@ -101,9 +95,6 @@ class Config(Options):
         classes = f"{len(self.classes)}, the number of config.classes"
         is_equal = count == len(self.classes)
         require(is_equal, "config.model.num_classes", count, classes)
-        for name, parts in _TRAINING_PARTS.items():
-            if ":" not in (part := getattr(self.train, name)):
-                find_function(part, f"config.train.{name}", parts)
         if self.train.evaluate_every_epochs:
             ious = self.evaluation.iou_thresholds
             known = [
@@ -130,10 +121,7 @@ class Config(Options):
         self.loss.find_terms()
         self.evaluation.find_protocols()
         self.evaluation.find_metrics()
-        for name, parts in _TRAINING_PARTS.items():
-            find_function(getattr(self.train, name), f"config.train.{name}", parts)
-        for hook in self.train.hooks:
-            find_function(hook, "config.train.hooks")
+        self.train.find_functions()
         for function in self.data.augmentation:
             find_function(function, "config.data.augmentation")
 

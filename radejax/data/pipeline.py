@@ -402,7 +402,8 @@ class _LoadBatch(grain.transforms.Map):
 def _check_augmented(found: Real[Array, "..."], usual: Real[Array, "R A C"]) -> None:
     """Raises `UserError` if an augmentation returned another kind of projection."""
     is_same = found.shape == usual.shape
-    is_same = is_same and np.can_cast(found.dtype, usual.dtype, "same_kind")
-    text = f"a projection {found.shape} {found.dtype}"
-    expected = f"{usual.shape} {usual.dtype}, as in the records"
-    require(is_same, "the result of config.data.augmentation", text, expected)
+    if not (is_same and np.can_cast(found.dtype, usual.dtype, "same_kind")):
+        raise UserError(
+            f"config.data.augmentation returned a projection {found.shape} {found.dtype}, "
+            f"expected {usual.shape} {usual.dtype}, as in the records"
+        )

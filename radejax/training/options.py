@@ -14,7 +14,10 @@ from radejax.core.options import (
     NotNegative,
     Options,
     Positive,
+    find_function,
 )
+
+_KNOWN = {"optimizer": ("adamw",), "schedule": ("cosine", "cyclic_cosine")}
 
 
 class TrainOptions(Options, section="config.train"):
@@ -74,7 +77,24 @@ class TrainOptions(Options, section="config.train"):
         peak = self.learning_rate
         expected = f"at most config.train.learning_rate, {peak}"
         require(final <= peak, "config.train.final_learning_rate", final, expected)
+        for name, known in _KNOWN.items():
+            value = getattr(self, name)
+            is_name = value in known or ":" in value
+            expected = f"{' or '.join(known)} or module:function"
+            require(is_name, f"config.train.{name}", value, expected)
         return self
+
+    def find_functions(self) -> None:
+        """Imports the optimizer, the schedule and the hooks that are named as module:function.
+
+        Raises:
+            UserError: One of them cannot be imported.
+        """
+        for name in ("optimizer", "schedule", "hooks"):
+            value = getattr(self, name)
+            for place in (value,) if isinstance(value, str) else value:
+                if place not in _KNOWN.get(name, ()):
+                    find_function(place, f"config.train.{name}")
 
 
 class LoggingOptions(Options, section="config.logging"):

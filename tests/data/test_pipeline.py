@@ -323,10 +323,12 @@ def test_a_corrupted_record_is_named_when_it_is_read(records, data, tmp_path):
 BOX = [10.0, -2.0, 0.5, 4.0, 2.0, 1.5, np.pi / 6]
 
 
-def frame_of(key, boxes=(), classes=()):
+def frame_of(key, boxes=(), classes=(), **columns):
     """What of a frame the table reads."""
     boxes = np.array(boxes, np.float64).reshape(-1, 7)
-    return types.SimpleNamespace(key=key, boxes=boxes, classes=np.array(classes, str))
+    classes = np.array(classes, str)
+    columns = {name: np.array(column) for name, column in columns.items()}
+    return types.SimpleNamespace(key=key, boxes=boxes, classes=classes, columns=columns)
 
 
 @pytest.fixture
@@ -352,6 +354,65 @@ def test_table_by_hand(written):
     np.testing.assert_allclose(table.boxes[0, 1], wanted, rtol=1e-6)
     assert table.boxes.dtype == np.float32
     assert not table.boxes[1:].any()
+
+
+@pytest.mark.wrong_types
+def test_targets_are_columns_of_the_kept_objects(written):
+    frames = [
+        frame_of("1/b", [BOX, BOX], ["Bicycle", "Sedan"], v=[[1.0, 2], [3, np.nan]]),
+        frame_of("1/a", [BOX], ["Sedan"]),
+    ]
+    table = make_table(
+        written, frames, max_objects=2, classes=("Sedan",), targets=("v",)
+    )
+    nan = np.nan
+    expected = [[[3, nan], [nan, nan]], [[nan, nan], [nan, nan]]]
+    np.testing.assert_array_equal(table.targets["v"], expected)
+    with pytest.raises(UserError, match=r"targets is 'w', expected a column .*: v$"):
+        make_table(written, frames, max_objects=2, targets=("w",))
+
+
+def test_targets_and_augmented_samples_come_with_the_batch(records, data):
+    frames = [
+        dataclasses.replace(frame, columns={"x": frame.boxes[:, 0]}) for frame in data
+    ]
+
+    def shifted(sample, rng):
+        projection = sample.projection + np.float16(rng.uniform())
+        x = sample.targets["x"] + 1
+        return dataclasses.replace(sample, projection=projection, targets={"x": x})
+
+    table = make_table(records, frames, max_objects=5, targets=("x",))
+    options = dataclasses.replace(OPTIONS, num_epochs=1)
+    augment = Augmentation(records.grid, others=[shifted])
+    for batch in make_loader(table, options, augment=augment):
+        is_valid = batch.is_valid
+        expected = batch.boxes[is_valid][:, 0] + 1
+        np.testing.assert_array_equal(batch.targets["x"][is_valid], expected)
+        assert batch.targets["x"].dtype == np.float32
+        for row, index in enumerate(batch.frame):
+            change = batch.projection[row] - records[data[index].key]
+            np.testing.assert_allclose(change, change.mean(), atol=2e-3)
+            assert change.mean() > 0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda x: x[1:],
+            r"\(15, 12, 11\) float16, expected \(16, 12, 11\) float16, as",
+        ),
+        (lambda x: x.astype(complex), "complex128, expected"),
+    ],
+)
+def test_own_augmentations_keep_the_shape(loader, records, change, message):
+    def own(sample, rng):
+        return dataclasses.replace(sample, projection=change(sample.projection))
+
+    batches = loader(Augmentation(records.grid, others=[own]), num_threads=0)
+    with pytest.raises(UserError, match=message):
+        next(batches)
 
 
 @pytest.mark.wrong_types

@@ -206,6 +206,19 @@ def test_encoded_boxes_come_back():
     assert found.is_valid[0].tolist() == [True] * 6 + [False] * 10
 
 
+def test_boxes_have_the_outputs_of_their_bins():
+    logits, params, cells, _ = scattered()
+    maps = maps_of(logits, params)
+    rows, columns = np.meshgrid(*map(np.arange, logits.shape[1:3]), indexing="ij")
+    outputs = {"bin": jnp.asarray(np.stack([rows, columns], -1)[None])}
+    outputs["sum"] = outputs["bin"].sum(-1)
+    found = decode(maps.replace(outputs=outputs), GRID)
+    assert found.outputs["bin"][0, :6].tolist() == cells.tolist()
+    boxes = found.to_boxes()
+    assert boxes.extras["sum"].tolist() == cells.sum(1).tolist()
+    assert boxes.to_list()[0]["bin"] == cells[0].tolist()
+
+
 def test_what_k_cuts_off_is_counted():
     logits, params, _, _ = scattered(num=10)
     counts = {}

@@ -3,6 +3,7 @@ import re
 import numpy as np
 import pytest
 
+from radejax.core.errors import UserError
 from radejax.evaluation import analysis
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files import Source, load
@@ -91,6 +92,24 @@ def test_box_errors_by_hand(data):
     assert errors["reversed"] == 0.5
     assert errors["length_m_median"] == 0
     assert np.isnan(analysis.box_errors(data, 0.3)["Bus or Truck"]["z_m_mean"])
+
+
+def test_own_metrics_of_matched_boxes():
+    boxes = np.array([[x, 0.0, 0, 4, 2, 1.5, 0] for x in (10.0, 30.0, 50.0)])
+    table = {"frame": np.zeros(3, int), "cls": np.array(["Sedan"] * 3)}
+    truth = {**table, "box": boxes, "speed": np.array([1.0, 2.0, np.nan])}
+    order = [2, 0, 1]  # the predictions are in another order than their objects
+    score = np.array([0.9, 0.8, 0.7])
+    found = {**table, "box": boxes[order], "score": score}
+    found["speed"] = np.array([9.0, 1.5, 4.0])
+    data = EvaluationSet(truth, found, classes=("Sedan",))
+    gap = lambda a, b: abs(a.extras["speed"] - b.extras["speed"])  # noqa: E731
+    errors = analysis.box_errors(data, 0.3, {"gap": gap})["Sedan"]
+    assert (errors["count"], errors["gap_mean"]) == (3, (0.5 + 2.0) / 2)
+    with pytest.raises(
+        UserError, match=r"gap returned is \(1,\), expected an array \[3\]"
+    ):
+        analysis.box_errors(data, 0.3, {"gap": lambda a, b: np.zeros(1)})
 
 
 def test_worst_frames_by_hand(data):

@@ -9,15 +9,18 @@ import jax
 import numpy as np
 import pytest
 import safetensors.numpy
+from flax.traverse_util import flatten_dict
 
 from radejax import Detector, UserError, models
 from radejax.cli.figures import MODEL
 from radejax.config import Config
 from radejax.core.errors import DataError
 from radejax.inference import exported_loader
+from radejax.inference import saved as saved_models
 from radejax.inference.saved import (
     WEIGHTS_FILE,
     load_model,
+    matching_weights,
     save_model,
     starting_weights,
 )
@@ -100,6 +103,33 @@ def test_weights_of_another_run_need_the_same_model(tmp_path):
     assert pretrained is None
     jax.tree.map(np.testing.assert_array_equal, variables, dict(model.variables))
     assert starting_weights(model.config.model) == (None, None, None)
+
+
+def test_matching_weights_are_those_of_equal_name_and_shape(
+    tmp_path, caplog, monkeypatch
+):
+    saved = small.saved()
+    save_model(saved, tmp_path)
+    options = saved.config.model.replace(num_classes=7, outputs={"velocity": 2})
+    with caplog.at_level("INFO", logger="radejax"):
+        part = matching_weights(tmp_path, models.build(options))
+    flat, own = (flatten_dict(x, sep="/") for x in (part, dict(saved.variables)))
+    other = {f"params/heads/heatmap/out/{name}" for name in ("kernel", "bias")}
+    assert own.keys() - flat.keys() == other
+    for name, values in flat.items():
+        np.testing.assert_array_equal(values, own[name])
+    assert f"{len(flat)} of {len(own)} arrays are used" in caplog.text
+    text = (
+        "2 arrays are of another shape, which are initialized: params/heads/heatmap/out"
+    )
+    assert text in caplog.text
+    assert "params/heads/velocity/out" in caplog.text
+    stranger = dataclasses.replace(saved, variables={"params": {"other": np.zeros(1)}})
+    monkeypatch.setattr(saved_models, "load_model", lambda path: stranger)
+    with pytest.raises(
+        UserError, match=r"--init-partial is .* a model with some equal"
+    ):
+        matching_weights(tmp_path, saved.model)
 
 
 def test_a_frozen_backbone_is_known_by_its_weights(tmp_path):

@@ -366,3 +366,36 @@ def test_wrong_shapes_are_rejected():
         detection_loss(maps, batch, STRETCHED)
     with pytest.raises(ValueError, match=r"must be \[3, N, 8\] .* got \(3, 4, 7\)"):
         detection_loss(maps, batch.replace(boxes=batch.boxes[..., :7]), GRID)
+
+
+# Own outputs and targets --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("assignment", ["center", "nms"])
+def test_own_terms_see_outputs_and_targets_of_the_matched_objects(
+    assignment, tmp_path, monkeypatch
+):
+    """The velocity of the second object is unknown: no error, and no gradient of NaN."""
+    (tmp_path / "own_loss.py").write_text(
+        "import jax.numpy as jnp\n"
+        "def velocity(pairs, options):\n"
+        "    assert pairs.maps.outputs['v'].shape == (3, 24, 16, 2)\n"
+        "    assert pairs.batch.targets['v_mps'].shape == (3, 4, 2)\n"
+        "    error = pairs.outputs['v'] - pairs.targets['v_mps']\n"
+        "    return pairs.mean(jnp.abs(error).sum(-1), where=pairs.is_known['v_mps'])\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    maps, batch = scene_with_peaks()
+    outputs = jnp.zeros((3, 24, 16, 2)).at[0, 10, 8].set(jnp.array([2.0, 1.5]))
+    targets = jnp.zeros((3, 4, 2)).at[0, :2].set(jnp.array([[1.0, 2.0], [3, jnp.nan]]))
+    (_, terms), grad = loss_and_grad(
+        maps.replace(outputs={"v": outputs}),
+        batch.replace(targets={"v_mps": targets}),
+        assignment=assignment,
+        own_terms=("own_loss:velocity",),
+        weights={"velocity": 2.0},
+        normalize=False,
+    )
+    assert float(terms["velocity"]) == pytest.approx((1.0 + 0.5) / 3)
+    touched = np.argwhere(np.abs(grad.outputs["v"]).sum(-1) > 0)
+    assert touched.tolist() == [[0, 10, 8]]

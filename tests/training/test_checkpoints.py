@@ -97,7 +97,7 @@ def test_state_position_and_info_come_back(folder: pathlib.Path) -> None:
     assert (info, step) == ({"config": {"a": 1.5}}, 2)
     np.testing.assert_array_equal(state["params"]["w"], WEIGHTS * 2)
     # The optimizer's moments, twice the size of the parameters, are not read.
-    assert set(state) == {"params", "ema_params", "model_state"}
+    assert set(state) == {"params", "ema_params", "model_state", "frozen"}
     assert state["ema_params"] is None
     with pytest.raises(FileNotFoundError, match=r"step 7 .*there are \[1, 2, 3\]"):
         _read(folder, 7)

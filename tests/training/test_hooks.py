@@ -36,6 +36,17 @@ def test_hooks_are_called_in_order_after_each_step() -> None:
     assert calls[:2] == [("a", 2, 7), ("b", 2, 7)]
 
 
+def test_values_that_an_own_hook_returns_are_logged(tmp_path: pathlib.Path) -> None:
+    own = lambda step, state, metrics: {"norm": 2.5} if step == 3 else None  # noqa: E731
+    with MetricWriter(tmp_path, Config(), 0) as writer:
+        hook = hooks.logged(own, writer)
+        for step in (2, 3, 4):
+            hook(step, None, {})
+    (line,) = (tmp_path / "metrics.jsonl").read_text().splitlines()
+    row = json.loads(line)
+    assert (row["step"], row["norm"]) == (3, 2.5)
+
+
 def test_the_loop_stops_between_steps() -> None:
     answers = iter([False, False, True])
     state: Any = SimpleNamespace(step=0, seen=[])

@@ -1,5 +1,6 @@
 """Schedule and optimizer against numbers worked out by hand and torch's AdamW rule."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import chex
@@ -11,7 +12,9 @@ import pytest
 from radejax.core.errors import UserError
 from radejax.training.options import TrainOptions
 from radejax.training.step import (
+    check_patterns,
     create_state,
+    freezing,
     make_optimizer,
     make_schedule,
     merge_parameters,
@@ -141,6 +144,51 @@ def test_frozen_parameters_have_no_update_and_no_optimizer_state() -> None:
     chex.assert_trees_all_equal(
         merge_parameters(*split_parameters(params, None)), params
     )
+
+
+def test_patterns_freeze_in_addition_to_the_model() -> None:
+    params = {"backbone": {"encoder_1": 1, "decoder_1": 2}, "image": {"w": 3}}
+    own = SimpleNamespace(is_frozen=lambda path: path.startswith("image/"))
+    is_frozen = freezing(own, ("backbone/encoder*",))
+    trained, frozen = split_parameters(params, is_frozen)
+    assert trained == {"backbone": {"decoder_1": 2}}
+    assert frozen == {"backbone": {"encoder_1": 1}, "image": {"w": 3}}
+    assert merge_parameters(trained, frozen) == params
+    assert split_parameters(params, freezing(SimpleNamespace(), ()))[0] == params
+    check_patterns(params, ("backbone/*",))
+    with pytest.raises(UserError, match=r"freeze is 'neck\*', .* in backbone, image, "):
+        check_patterns(params, ("image*", "neck*"))
+    with pytest.raises(UserError, match="expected patterns that leave parameters"):
+        check_patterns(params, ("*",))
+
+
+def _made(fields: dict[str, str]) -> None:
+    train = TrainOptions(num_epochs=1, **fields)
+    make_optimizer(train, make_schedule(train, 5))
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        (
+            {"optimizer": "lion"},
+            "optimizer is 'lion', expected adamw or module:function",
+        ),
+        (
+            {"optimizer": "builtins:print"},
+            "expected a function that returns an optax.Grad",
+        ),
+        ({"optimizer": "optax:no"}, "module 'optax' has no attribute 'no'"),
+        ({"schedule": "linear"}, "expected cosine or cyclic_cosine or module:function"),
+        (
+            {"schedule": "sys:path"},
+            "schedule is 'sys:path', expected the name of a func",
+        ),
+    ],
+)
+def test_wrong_optimizers_and_schedules_are_named(fields: Any, message: str) -> None:
+    with pytest.raises(UserError, match=rf"^config\.train\..*{message}"):
+        _made(fields)
 
 
 def test_eval_variables_are_the_averaged_ones_where_there_are_any() -> None:
