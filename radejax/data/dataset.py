@@ -15,9 +15,9 @@ from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Self, TypeVar, overload
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Bool, Float, Shaped
 
-from radejax.core.errors import UserError
+from radejax.core.errors import UserError, require
 from radejax.core.files import JsonObject
 from radejax.core.options import find_part
 from radejax.data.options import DataOptions
@@ -126,6 +126,15 @@ class LabelledFrame:
     def key(self) -> str:
         """Name that is unique in a dataset, such as `"1/00033_00001"`."""
         return f"{self.sequence}/{self.name}"
+
+    def with_objects(self, rows: Bool[np.ndarray, " N"]) -> Self:
+        """Returns the frame with only the objects where `rows` is True."""
+        return dataclasses.replace(
+            self,
+            boxes=self.boxes[rows],
+            classes=self.classes[rows],
+            columns={name: values[rows] for name, values in self.columns.items()},
+        )
 
     def read_projection(self, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
         """Reads the radar data and returns their float32 projection on the grid.
@@ -283,7 +292,7 @@ class LabelledFrames(Sequence[_F]):
         view. The summary counts them.
 
         Raises:
-            UserError: Yaws are in degrees.
+            UserError: Yaws are in degrees, or a column has not one row per box.
         """
         counts = collections.Counter[str]()
         frames: list[LabelledFrame] = []
@@ -306,10 +315,13 @@ class LabelledFrames(Sequence[_F]):
                     f"frame {frame.key}: yaw is {yaw[np.abs(yaw).argmax()]:g}, expected "
                     "radians"
                 )
+            for name, values in frame.columns.items():
+                expected = f"one row for each of {len(boxes)} boxes"
+                what = f"frame {frame.key}: column {name!r}, number of rows"
+                require(len(values) == len(boxes), what, len(values), expected)
             if not kept.all():
-                frame = dataclasses.replace(
-                    frame, boxes=boxes[kept], classes=names[kept]
-                )
+                frame = dataclasses.replace(frame, boxes=boxes, classes=names)
+                frame = frame.with_objects(kept)
             frames.append(frame)
         return self._with(frames, self._summary.plus(Summary(counts)))
 

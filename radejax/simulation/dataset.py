@@ -70,8 +70,8 @@ def simulate_dataset(
 
     Returns:
         `root` as a path. The folder contains a complete K-Radar tree: tesseracts or
-        projections, front images, labels (v2.1), calibration and description of each
-        sequence, the splits, the camera calibrations and, for a grid other than
+        projections, front images, labels (v2.1), calibration, motion and description of
+        each sequence, the splits, the camera calibrations and, for a grid other than
         K-Radar's, `radar_grid.json`.
 
     Raises:
@@ -193,6 +193,8 @@ class Writer:
             missing += [spec for spec in specs if spec.name not in there]
             for spec in specs:
                 names[spec.split].append((number, spec.name))
+            if not (folder / "info_motion" / "objects.csv").is_file():
+                self._write_motion(folder / "info_motion", specs)
         kradar_write.write_splits(self.root / "split", **names)
         if self.options.grid != "kradar":
             kradar_write.write_grid(self.root, self.options.make_grid())
@@ -201,6 +203,25 @@ class Writer:
                 path = self.root / "calib" / "common" / f"cam_front{index}.yml"
                 files.write_text(path, calibration.to_kradar_text())
         return missing
+
+    def _write_motion(self, folder: pathlib.Path, specs: list[FrameSpec]) -> None:
+        """Writes the motion of the ego vehicle and of the labelled objects."""
+        sequence = self.source.make(specs[0].sequence)
+        tracks = sequence.tracks
+        ego: list[tuple[str | float, ...]] = []
+        objects: list[tuple[str | float, ...]] = []
+        for spec in specs:
+            frame = sequence.frame(spec.scene_idx, self.options.label_distance_m)
+            pose = sequence.ego_pose[spec.scene_idx]
+            motion = frame.ego_velocity_mps[0], frame.ego_yaw_rate_radps
+            ego.append((spec.name, spec.timestamp_s, *pose, *motion))
+            velocities = frame.relative_velocity_mps
+            objects += [
+                (spec.name, tracks.label_cls[n], int(tracks.track_id[n]), *velocity_mps)
+                for n, velocity_mps in zip(frame.track, velocities, strict=True)
+                if tracks.track_id[n] >= 0
+            ]
+        kradar_write.write_motion(folder, ego, objects)
 
     def write_frames(
         self, missing: list[FrameSpec], num_workers: int, bar: tqdm

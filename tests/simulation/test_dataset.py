@@ -109,6 +109,50 @@ class TestTree:
             np.testing.assert_allclose(a.box[3:6], b.box[3:6])
             assert np.hypot(a.box[0] - b.box[0], a.box[1] - b.box[1]) < 6.0
 
+    def test_velocities_are_the_motion_of_the_labels(self, tree):
+        read = {f.key: f for f in KRadar(tree, visibility=None)}
+        for number in (1, 2, 3):
+            first, second, third = (f for f in read.values() if f.sequence == number)
+            known = [
+                dict(zip(f.columns["track_id"].tolist(), values, strict=True))
+                for f, values in (
+                    (first, first.boxes),
+                    (second, second.columns["velocity_mps"]),
+                    (third, third.boxes),
+                )
+            ]
+            tracks = set.intersection(*map(set, known))
+            assert len(tracks) >= 3
+            for track in tracks:
+                before, velocity, after = (values[track] for values in known)
+                expected = (after[:2] - before[:2]) / 0.2
+                np.testing.assert_allclose(velocity, expected, atol=0.7)
+
+    def test_ego_motion_turns_relative_velocities_to_those_over_ground(self, tree):
+        number = 3  # a mountain road, with bends
+        path = tree / str(number) / "info_motion" / "ego.csv"
+        names, *numbers = np.loadtxt(path, str, delimiter=",", unpack=True)
+        ego = {column[0]: column[1:].astype(float) for column in numbers}
+        steps = np.hypot(np.diff(ego["x_m"]), np.diff(ego["y_m"]))
+        np.testing.assert_allclose(steps, 0.1 * ego["speed_mps"][:-1], rtol=1e-3)
+        turns = np.diff(ego["heading_rad"])
+        np.testing.assert_allclose(turns, 0.1 * ego["yaw_rate_radps"][:-1], atol=2e-6)
+        assert np.abs(turns).max() > 1e-3
+        scene = make_source(small_config()).make(number)
+        frames = [f for f in KRadar(tree, visibility=None) if f.sequence == number]
+        assert names.tolist() == ["frame", *(f.name for f in frames)]
+        for index, frame in enumerate(frames):
+            x_m, y_m = frame.boxes[:, :2].T
+            turning = ego["yaw_rate_radps"][index] * np.stack([-y_m, x_m], 1)
+            velocity = frame.columns["velocity_mps"] + turning
+            velocity[:, 0] += ego["speed_mps"][index]
+            tracks = frame.columns["track_id"] - 1  # of procedural sequences
+            expected = scene.tracks.velocity_mps[index, tracks]
+            speed = np.linalg.norm(velocity, axis=1)
+            np.testing.assert_allclose(
+                speed, np.linalg.norm(expected, axis=1), atol=0.1
+            )
+
 
 class TestRepeating:
     def test_same_seed_same_bytes_by_worker_processes(self, tree, tmp_path):

@@ -18,13 +18,13 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Shaped
+from jaxtyping import Float, Shaped
 
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import PathLike, as_path
 from radejax.core.structures import CLASSES
 from radejax.data.dataset import LabelledFrame, LabelledFrames, Summary
-from radejax.data.kradar import conditions, folders
+from radejax.data.kradar import conditions, folders, motion
 from radejax.data.kradar.labels import (
     LABEL_CLASSES,
     VERSIONS,
@@ -59,12 +59,15 @@ class Frame(LabelledFrame):
     """One labelled frame of K-Radar.
 
     The `name` consists of the radar and LiDAR frame numbers, such as `"00033_00001"`.
-    `boxes` contains only the objects that the options of the dataset keep.
+    `boxes` contains only the objects that the options of the dataset keep. The `columns`
+    are "track_id" (-1 if unknown), "visibility" (the flag) and "velocity_mps" `[N, 2]`: the
+    change of x and y over time in the radar frame, so relative to the radar. It is read
+    from the files of simulated sequences and otherwise estimated from the labels before
+    and after (`motion.estimate_velocities`), and NaN where it is unknown.
 
     Attributes:
         header: Frame numbers of all sensors and the time stamp.
         labels: All objects of the label file, unfiltered and in the LiDAR frame.
-        visibility: Visibility flags of `boxes`.
         tesseract_path: File of the 4D radar tensor, or None if it is missing.
         projection_path: File of the `.npy` projection of the reference implementation,
             or of a reduced release, or None if it is missing. It is the `radar_path` if
@@ -73,9 +76,13 @@ class Frame(LabelledFrame):
 
     header: LabelHeader
     labels: tuple[Label, ...]
-    visibility: Shaped[np.ndarray, " N"]
     tesseract_path: pathlib.Path | None
     projection_path: pathlib.Path | None
+
+    @property
+    def visibility(self) -> Shaped[np.ndarray, " N"]:
+        """Visibility flags of `boxes`."""
+        return self.columns["visibility"]
 
     def read_projection(self, grid: RadarGrid) -> np.ndarray:
         """Reads the float32 projection, see `tesseract.read_frame`."""
@@ -322,8 +329,9 @@ def read(index: Index, keys: Iterable[Key]) -> tuple[list[Frame], Summary]:
         summary.counts["frames left out by weather"] = len(keys) - len(kept)
         keys = kept
     files = _read_label_files(index, keys, summary)
+    velocities = _velocities(index, files, summary)
     frames = [
-        _make_frame(index, key, file, sequences[key[0]], summary)
+        _make_frame(index, key, file, velocities[key], sequences[key[0]], summary)
         for key, file in files.items()
     ]
     return frames, summary
@@ -427,8 +435,39 @@ def _read_label_files(
     return files
 
 
+def _velocities(
+    index: Index, files: Mapping[Key, LabelFile], summary: Summary
+) -> dict[Key, Float[np.ndarray, "N 2"]]:
+    """Returns the velocities of the labels of every file in m/s, see `Frame`."""
+    known = {}
+    for number in {key[0] for key in files}:
+        folder = index.sequences.get(number, folders.NO_FOLDER)
+        path = folder.find("info_motion", "objects.csv")
+        table = _read_or_report(motion.read_velocities, path, "motion", summary)
+        if table is not None:
+            known[number] = table
+    # An estimate needs the labels before and after, which may be of another split. Their
+    # problems are reported where their own split is read.
+    every = [key for key in index.label_paths if key[0] not in known]
+    read = [position for position, key in enumerate(every) if key in files]
+    positions = {position + step for position in read for step in range(-2, 3)}
+    near = [key for position, key in enumerate(every) if position in positions]
+    velocities = motion.estimate_velocities(_read_label_files(index, near, Summary()))
+    for key, file in files.items():
+        if (table := known.get(key[0])) is not None:
+            names = [(key[1], label.cls, label.track_id) for label in file.labels]
+            found = [table.get(name, (np.nan, np.nan)) for name in names]
+            velocities[key] = np.array(found).reshape(-1, 2)
+    return velocities
+
+
 def _make_frame(
-    index: Index, key: Key, file: LabelFile, sequence: _Sequence, summary: Summary
+    index: Index,
+    key: Key,
+    file: LabelFile,
+    velocity_mps: Float[np.ndarray, "N 2"],
+    sequence: _Sequence,
+    summary: Summary,
 ) -> Frame:
     """Returns a frame with all of its objects and the files that there are.
 
@@ -461,7 +500,11 @@ def _make_frame(
         labels=tuple(file.labels),
         boxes=boxes,
         classes=np.array([label.cls for label in file.labels], np.str_),
-        visibility=np.array([label.visibility for label in file.labels], np.str_),
+        columns={
+            "track_id": np.array([label.track_id for label in file.labels], np.int64),
+            "velocity_mps": velocity_mps,
+            "visibility": np.array([x.visibility for x in file.labels], np.str_),
+        },
         tesseract_path=tesseract,
         projection_path=projection,
         radar_path=tesseract or projection,
@@ -498,12 +541,7 @@ def select(
     counts["objects kept"] = int(is_kept.sum())
     ends = np.cumsum([len(frame.boxes) for frame in frames])
     selected = [
-        dataclasses.replace(
-            frame,
-            boxes=frame.boxes[rows],
-            classes=frame.classes[rows],
-            visibility=frame.visibility[rows],
-        )
+        frame.with_objects(rows)
         for frame, rows in zip(frames, np.split(is_kept, ends)[:-1], strict=True)
     ]
     counts["frames"] = len(selected)

@@ -14,14 +14,11 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import median_filter  # type: ignore[attr-defined]
 
-from radejax.data.kradar import Frame, Label
+from radejax.data.kradar import Frame, Label, motion
 from radejax.simulation.world import environments, scene
 from radejax.simulation.world.scene import Road, Sequence, Tracks
 
 Shift = tuple[float, float, float]
-
-MAX_SPEED_MPS = 60.0
-"""Relative speed above which motion is assumed to be a swap of track identities."""
 
 
 def make_real_sequence(
@@ -110,37 +107,14 @@ def relative_velocity(
 ) -> Float[np.ndarray, "F N 2"]:
     """Computes velocities relative to the radar from the motion of the labels.
 
-    Velocities are central differences where the track is present in both adjacent frames,
-    one-sided differences at its ends, and zero for tracks of one frame and above
-    `MAX_SPEED_MPS`. As labels jitter by some centimeters, three successive velocities are
-    averaged.
+    They are those of `motion.track_velocities`, and zero where these are NaN.
     """
-    flat = tracks.position_m[..., :2]
-    count = len(clock)
-    present = tracks.is_present
-    before = np.maximum(np.arange(count) - 1, 0)
-    after = np.minimum(np.arange(count) + 1, count - 1)
-    here = np.arange(count)[:, None]
-    first = np.where(present[before], before[:, None], here)  # [F, N]
-    last = np.where(present[after], after[:, None], here)
-    column = np.arange(flat.shape[1])[None]
-    period = clock[last] - clock[first]
-    step = flat[last, column] - flat[first, column]
-    usable = present & (period > 1e-3)
-    velocity = np.where(
-        usable[..., None], step / np.where(usable, period, 1.0)[..., None], 0.0
-    )
-    too_fast = np.hypot(velocity[..., 0], velocity[..., 1]) > MAX_SPEED_MPS
-    velocity[too_fast] = 0.0
-    weight = (usable & ~too_fast).astype(float)[..., None]
-
-    def sum_of_three(values: np.ndarray) -> np.ndarray:
-        padded = np.pad(values, ((1, 1), (0, 0), (0, 0)))
-        total: np.ndarray = padded[:-2] + padded[1:-1] + padded[2:]
-        return total
-
-    smooth = sum_of_three(velocity * weight) / np.maximum(sum_of_three(weight), 1.0)
-    return np.where(weight > 0, smooth, 0.0)
+    frame, track = np.nonzero(tracks.is_present)
+    position_m = tracks.position_m[frame, track, :2]
+    velocity = np.zeros((*tracks.is_present.shape, 2))
+    found = motion.track_velocities(position_m, track, frame, clock)
+    velocity[frame, track] = np.nan_to_num(found)
+    return velocity
 
 
 def infer_ego_speed(

@@ -114,6 +114,7 @@ class SceneFrame:
         reflectors: Static surroundings near the ego, in this frame.
         reflector_idx: Indices of these reflectors in the sequence.
         index: Index of the frame in its sequence.
+        ego_yaw_rate_radps: Turning rate of the radar, positive to the left.
     """
 
     boxes: Float[np.ndarray, "N 7"]
@@ -124,6 +125,15 @@ class SceneFrame:
     reflectors: Reflectors
     reflector_idx: Int[np.ndarray, " M"]
     index: int
+    ego_yaw_rate_radps: float = 0.0
+
+    @property
+    def relative_velocity_mps(self) -> Float[np.ndarray, "N 2"]:
+        """Change of the boxes' x and y over time in the turning radar frame."""
+        x_m, y_m = self.boxes[:, :2].T
+        turning = self.ego_yaw_rate_radps * np.stack([-y_m, x_m], 1)
+        relative: np.ndarray = self.velocity_mps - self.ego_velocity_mps - turning
+        return relative
 
 
 @dataclasses.dataclass(frozen=True)
@@ -194,6 +204,7 @@ class Sequence:
             ),
             reflector_idx=seen,
             index=index,
+            ego_yaw_rate_radps=self.ego_speed_mps[index] * self.road.curvature_per_m,
         )
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import UserError
-from radejax.data.kradar import KRadar, read_labels, write
+from radejax.data.kradar import KRadar, motion, read_labels, write
 from radejax.data.kradar.labels import Label
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
@@ -106,7 +106,7 @@ class TestScene:
         tracks.position_m[8, tracks.track_id == 7] += [500.0, 0.0, 0.0]
         clock = 0.1 * np.arange(NUM_FRAMES)
         relative = replay.relative_velocity(tracks, clock)
-        assert np.abs(relative).max() < replay.MAX_SPEED_MPS
+        assert np.abs(relative).max() < motion.MAX_SPEED_MPS
 
 
 class TestWrittenTree:
