@@ -316,9 +316,9 @@ class LabelledFrames(Sequence[_F]):
                     "radians"
                 )
             for name, values in frame.columns.items():
-                expected = f"one row for each of {len(boxes)} boxes"
-                what = f"frame {frame.key}: column {name!r}, number of rows"
-                require(len(values) == len(boxes), what, len(values), expected)
+                what = f"frame {frame.key}: number of rows of column {name!r}"
+                is_equal = len(values) == len(boxes)
+                require(is_equal, what, len(values), f"{len(boxes)}, one per box")
             if not kept.all():
                 frame = dataclasses.replace(frame, boxes=boxes, classes=names)
                 frame = frame.with_objects(kept)

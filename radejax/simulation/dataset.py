@@ -27,6 +27,7 @@ from tqdm import tqdm
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
 from radejax.core.workers import default_workers, process_pool
+from radejax.data.kradar import motion
 from radejax.data.kradar import write as kradar_write
 from radejax.data.kradar.folders import SIMULATION_MARKER
 from radejax.data.kradar.labels import Label
@@ -208,20 +209,20 @@ class Writer:
         """Writes the motion of the ego vehicle and of the labelled objects."""
         sequence = self.source.make(specs[0].sequence)
         tracks = sequence.tracks
-        ego: list[tuple[str | float, ...]] = []
-        objects: list[tuple[str | float, ...]] = []
+        ego, objects = [motion.EGO_HEADER], [motion.OBJECT_HEADER]
         for spec in specs:
             frame = sequence.frame(spec.scene_idx, self.options.label_distance_m)
-            pose = sequence.ego_pose[spec.scene_idx]
-            motion = frame.ego_velocity_mps[0], frame.ego_yaw_rate_radps
-            ego.append((spec.name, spec.timestamp_s, *pose, *motion))
-            velocities = frame.relative_velocity_mps
-            objects += [
-                (spec.name, tracks.label_cls[n], int(tracks.track_id[n]), *velocity_mps)
-                for n, velocity_mps in zip(frame.track, velocities, strict=True)
-                if tracks.track_id[n] >= 0
-            ]
-        kradar_write.write_motion(folder, ego, objects)
+            moved = frame.ego_velocity_mps[0], frame.ego_yaw_rate_radps
+            numbers = spec.timestamp_s, *sequence.ego_pose[spec.scene_idx], *moved
+            ego.append(",".join([spec.name, *(f"{x:.6f}" for x in numbers)]))
+            for n, (vx, vy) in zip(
+                frame.track, frame.relative_velocity_mps, strict=True
+            ):
+                if (track_id := tracks.track_id[n]) >= 0:
+                    identity = f"{spec.name},{tracks.label_cls[n]},{track_id}"
+                    objects.append(f"{identity},{vx:.6f},{vy:.6f}")
+        files.write_text(folder / "ego.csv", "\n".join([*ego, ""]))
+        files.write_text(folder / "objects.csv", "\n".join([*objects, ""]))
 
     def write_frames(
         self, missing: list[FrameSpec], num_workers: int, bar: tqdm

@@ -439,23 +439,21 @@ def _velocities(
     index: Index, files: Mapping[Key, LabelFile], summary: Summary
 ) -> dict[Key, Float[np.ndarray, "N 2"]]:
     """Returns the velocities of the labels of every file in m/s, see `Frame`."""
-    known = {}
-    for number in {key[0] for key in files}:
-        folder = index.sequences.get(number, folders.NO_FOLDER)
-        path = folder.find("info_motion", "objects.csv")
-        table = _read_or_report(motion.read_velocities, path, "motion", summary)
-        if table is not None:
-            known[number] = table
     # An estimate needs the labels before and after, which may be of another split. Their
     # problems are reported where their own split is read.
-    every = [key for key in index.label_paths if key[0] not in known]
+    every = list(index.label_paths)
     read = [position for position, key in enumerate(every) if key in files]
     positions = {position + step for position in read for step in range(-2, 3)}
     near = [key for position, key in enumerate(every) if position in positions]
     velocities = motion.estimate_velocities(_read_label_files(index, near, Summary()))
-    for key, file in files.items():
-        if (table := known.get(key[0])) is not None:
-            names = [(key[1], label.cls, label.track_id) for label in file.labels]
+    for number, keys in itertools.groupby(files, key=lambda key: key[0]):
+        folder = index.sequences.get(number, folders.NO_FOLDER)
+        path = folder.find("info_motion", "objects.csv")
+        table = _read_or_report(motion.read_velocities, path, "motion", summary)
+        if table is None:
+            continue
+        for key in keys:
+            names = [(key[1], label.cls, label.track_id) for label in files[key].labels]
             found = [table.get(name, (np.nan, np.nan)) for name in names]
             velocities[key] = np.array(found).reshape(-1, 2)
     return velocities

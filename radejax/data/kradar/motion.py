@@ -6,8 +6,7 @@ the change of its position over time is its velocity relative to the radar.
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -16,10 +15,13 @@ from radejax.core.archives import wrap_read_errors
 from radejax.core.errors import DataError
 from radejax.core.files import PathLike, read_text
 from radejax.core.structures import frame_key
-from radejax.data.kradar.labels import Key, LabelFile
+from radejax.data.kradar.labels import Key, Label, LabelFile
 
-OBJECT_COLUMNS = ("frame", "class", "track_id", "vx_mps", "vy_mps")
-"""Columns of `info_motion/objects.csv`; see docs/file_formats.md."""
+OBJECT_HEADER = "frame,class,track_id,vx_mps,vy_mps"
+"""First line of `info_motion/objects.csv`; see docs/file_formats.md."""
+
+EGO_HEADER = "frame,timestamp_s,x_m,y_m,heading_rad,speed_mps,yaw_rate_radps"
+"""First line of `info_motion/ego.csv`; see docs/file_formats.md."""
 
 MAX_SPEED_MPS = 60.0
 """Relative speed above which motion is assumed to be a swap of track identities."""
@@ -38,13 +40,12 @@ def read_velocities(path: PathLike) -> dict[tuple[str, str, int], tuple[float, f
         DataError: The file is malformed.
     """
     with wrap_read_errors(path, "a table of velocities"):
-        header, *rows = csv.reader(read_text(path).splitlines())
-        if tuple(header) != OBJECT_COLUMNS:
-            expected = ",".join(OBJECT_COLUMNS)
-            raise DataError(f"{path}:1: {','.join(header)!r}, expected {expected}")
+        header, *lines = read_text(path).splitlines()
+        if header != OBJECT_HEADER:
+            raise DataError(f"{path}:1: {header[:80]!r}, expected {OBJECT_HEADER!r}")
         return {
             (frame_key(name), cls, int(track_id)): (float(vx_mps), float(vy_mps))
-            for name, cls, track_id, vx_mps, vy_mps in rows
+            for name, cls, track_id, vx_mps, vy_mps in (x.split(",") for x in lines)
         }
 
 
@@ -63,30 +64,50 @@ def estimate_velocities(
     """
     labels = [label for file in files.values() for label in file.labels]
     counts = [len(file.labels) for file in files.values()]
-    frame_idx = np.repeat(np.arange(len(counts)), counts)
-    numbers: dict[tuple[int, str, int], int] = {}
-    last_seen: dict[int, int] = {}
-    track_idx = np.arange(len(labels)) + len(labels)  # tracks of one label
-    sequences = [key[0] for key in files]
-    for row, (label, frame) in enumerate(zip(labels, frame_idx.tolist(), strict=True)):
-        identity = sequences[frame], label.cls, label.track_id
-        number = numbers.setdefault(identity, len(numbers))
-        if label.track_id >= 0 and last_seen.get(number) != frame:
-            track_idx[row] = number
-            last_seen[number] = frame
-    position_m = np.array([label.box[:2] for label in labels]).reshape(-1, 2)
+    sequence = np.array([key[0] for key in files])
     clock_s = np.array([file.header.timestamp_s for file in files.values()])
-    velocity = track_velocities(position_m, track_idx, frame_idx, clock_s, MAX_GAP_S)
+    is_gap = np.diff(clock_s, prepend=clock_s[:1]) > MAX_GAP_S
+    is_gap |= np.diff(sequence, prepend=sequence[:1]) > 0
+    frame_idx = np.repeat(np.arange(len(files)) + np.cumsum(is_gap), counts)
+    velocity = track_velocities(
+        np.reshape([label.box[:2] for label in labels], (-1, 2)),
+        number_tracks(labels, frame_idx),
+        frame_idx,
+        np.repeat(clock_s, counts),
+    )
     split = np.split(velocity, np.cumsum(counts, dtype=int))
     return dict(zip(files, split[:-1], strict=True))
+
+
+def number_tracks(
+    labels: Sequence[Label], frame_idx: Int[np.ndarray, " M"]
+) -> Int[np.ndarray, " M"]:
+    """Returns the index of the first label of the track of each label.
+
+    Labels with the same track id and class form a track. A label without an id (-1), or
+    with the id and class of an earlier label in the same frame, is a track of its own.
+
+    Args:
+        labels: Labels of all frames of a sequence, in order.
+        frame_idx: Their frames.
+    """
+    first_idx = np.arange(len(labels))
+    last: dict[tuple[str, int], int] = {}
+    for row, label in enumerate(labels):
+        identity = label.cls, label.track_id
+        before = last.get(identity, row)
+        is_free = before == row or frame_idx[before] != frame_idx[row]
+        if label.track_id >= 0 and is_free:
+            first_idx[row] = first_idx[before]
+            last[identity] = row
+    return first_idx
 
 
 def track_velocities(
     position_m: Float[np.ndarray, "M 2"],
     track_idx: Int[np.ndarray, " M"],
     frame_idx: Int[np.ndarray, " M"],
-    clock_s: Float[np.ndarray, " F"],
-    max_gap_s: float = np.inf,
+    time_s: Float[np.ndarray, " M"],
 ) -> Float[np.ndarray, "M 2"]:
     """Computes velocities by differences of positions along tracks.
 
@@ -98,34 +119,29 @@ def track_velocities(
         position_m: x and y of objects.
         track_idx: Their tracks.
         frame_idx: Their frames, with one object of a track per frame.
-        clock_s: Times of the frames.
-        max_gap_s: Longest time between adjacent frames.
+        time_s: Times of the frames.
 
     Returns:
         x and y in m/s. NaN for tracks of one frame and above `MAX_SPEED_MPS`.
     """
     order = np.lexsort((frame_idx, track_idx))
-    track, frame, position = track_idx[order], frame_idx[order], position_m[order]
-    joined = (np.diff(track) == 0) & (np.diff(frame) == 1)
-    joined &= np.diff(clock_s[frame]) <= max_gap_s
+    position, time = position_m[order], time_s[order]
+    joined = (np.diff(track_idx[order]) == 0) & (np.diff(frame_idx[order]) == 1)
     rows = np.arange(len(order))
     first = rows - np.pad(joined, (1, 0))[: len(rows)]
     last = rows + np.pad(joined, (0, 1))[: len(rows)]
-    period = clock_s[frame[last]] - clock_s[frame[first]]
+    period = time[last] - time[first]
     is_known = period > 1e-3
-    step = position[last] - position[first]
-    velocity = step / np.where(is_known, period, 1.0)[:, None]
+    velocity = (position[last] - position[first]) / np.where(is_known, period, 1)[
+        :, None
+    ]
     is_known &= np.hypot(*velocity.T) <= MAX_SPEED_MPS
     velocity[~is_known] = 0.0
-
-    def sum_of_three(values: np.ndarray) -> np.ndarray:
-        before, after = np.zeros_like(values), np.zeros_like(values)
-        before[1:][joined] = values[:-1][joined]
-        after[:-1][joined] = values[1:][joined]
-        total: np.ndarray = before + values + after
-        return total
-
-    count = np.maximum(sum_of_three(is_known.astype(float)), 1.0)[:, None]
+    values = np.column_stack([velocity, is_known])
+    total = values.copy()  # sums of three
+    total[1:][joined] += values[:-1][joined]
+    total[:-1][joined] += values[1:][joined]
+    mean = total[:, :2] / np.maximum(total[:, 2:], 1.0)
     result = np.zeros((len(order), 2))
-    result[order] = np.where(is_known[:, None], sum_of_three(velocity) / count, np.nan)
+    result[order] = np.where(is_known[:, None], mean, np.nan)
     return result

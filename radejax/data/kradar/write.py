@@ -16,13 +16,7 @@ from jaxtyping import Real
 
 from radejax.core.files import PathLike, atomic_write, write_text
 from radejax.data.kradar.labels import Key, Label, normalize_version
-from radejax.data.kradar.motion import OBJECT_COLUMNS
 from radejax.geometry.radar_grid import RadarGrid
-
-EGO_COLUMNS = (
-    "frame", "timestamp_s", "x_m", "y_m", "heading_rad", "speed_mps", "yaw_rate_radps",
-)  # fmt: skip
-"""Columns of `info_motion/ego.csv`; see docs/file_formats.md."""
 
 _SENSORS = "tesseract_os2-64_cam-front_os1-128_cam-lrr"
 _MAT_TEXT = b"MATLAB 5.0 MAT-file, written by radejax"
@@ -89,27 +83,6 @@ def write_splits(folder: PathLike, train: Iterable[Key], test: Iterable[Key]) ->
     for name, frames in (("train", train), ("test", test)):
         lines = [f"{sequence},{frame}.txt" for sequence, frame in frames]
         write_text(pathlib.Path(folder) / f"{name}.txt", "\n".join(lines))
-
-
-def write_motion(
-    folder: PathLike,
-    ego: Iterable[Sequence[str | float]],
-    objects: Iterable[Sequence[str | float]],
-) -> None:
-    """Writes `ego.csv` and `objects.csv`, the motion in one sequence.
-
-    Args:
-        folder: Folder to write to, normally `<root>/<sequence>/info_motion`.
-        ego: Rows with the values of `EGO_COLUMNS`.
-        objects: Rows with the values of `OBJECT_COLUMNS`.
-    """
-    tables = {"ego": (EGO_COLUMNS, *ego), "objects": (OBJECT_COLUMNS, *objects)}
-    for name, rows in tables.items():
-        texts = (
-            [f"{x:.6f}" if isinstance(x, float) else x for x in row] for row in rows
-        )
-        lines = [",".join(map(str, row)) for row in texts]
-        write_text(pathlib.Path(folder) / f"{name}.csv", "\n".join(lines) + "\n")
 
 
 def write_tesseract(

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import median_filter  # type: ignore[attr-defined]
 
-from radejax.data.kradar import Frame, Label, motion
+from radejax.data.kradar import Frame, motion
 from radejax.simulation.world import environments, scene
 from radejax.simulation.world.scene import Road, Sequence, Tracks
 
@@ -70,25 +70,20 @@ def make_real_sequence(
 def collect_tracks(frames: list[Frame], radar_from_lidar_m: Shift) -> Tracks:
     """Collects the labels of all frames as tracks with positions in the radar frame.
 
-    Labels with the same track id and class form a track. A label without an id (-1), or
-    with the id and class of an earlier label in the same frame, becomes a track of one
-    frame.
+    The tracks are those of `motion.number_tracks`.
     """
-    columns: dict[tuple[str | int, ...], dict[int, Label]] = {}
-    for index, frame in enumerate(frames):
-        for number, label in enumerate(frame.labels):
-            key: tuple[str | int, ...] = (label.cls, label.track_id)
-            if label.track_id < 0 or index in columns.get(key, {}):
-                key = (label.cls, label.track_id, index, number)
-            columns.setdefault(key, {})[index] = label
-    first = [next(iter(track.values())) for track in columns.values()]
-    boxes = np.zeros((len(frames), len(columns), 7))
+    labels = [label for frame in frames for label in frame.labels]
+    counts = [len(frame.labels) for frame in frames]
+    frame_idx = np.repeat(np.arange(len(frames)), counts)
+    rows, track_idx = np.unique(
+        motion.number_tracks(labels, frame_idx), return_inverse=True
+    )
+    first = [labels[row] for row in rows]
+    boxes = np.zeros((len(frames), len(first), 7))
     boxes[..., 3:6] = np.reshape([label.box for label in first], (-1, 7))[:, 3:6]
+    boxes[frame_idx, track_idx] = np.reshape([x.box for x in labels], (-1, 7))
     present = np.zeros(boxes.shape[:2], bool)
-    for n, track in enumerate(columns.values()):
-        for index, label in track.items():
-            boxes[index, n] = label.box
-            present[index, n] = True
+    present[frame_idx, track_idx] = True
     boxes[..., :3] += radar_from_lidar_m
     return Tracks(
         position_m=boxes[..., :3],
@@ -112,7 +107,7 @@ def relative_velocity(
     frame, track = np.nonzero(tracks.is_present)
     position_m = tracks.position_m[frame, track, :2]
     velocity = np.zeros((*tracks.is_present.shape, 2))
-    found = motion.track_velocities(position_m, track, frame, clock)
+    found = motion.track_velocities(position_m, track, frame, clock[frame])
     velocity[frame, track] = np.nan_to_num(found)
     return velocity
 

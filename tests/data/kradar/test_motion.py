@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.data.dataset import LabelledFrame, LabelledFrames
 from radejax.data.kradar import KRadar, motion, write
@@ -62,11 +63,10 @@ def test_velocities_at_the_ends_of_a_split_use_the_other_split(tmp_path):
 def test_velocities_of_the_file_are_used_instead(tmp_path):
     write_labels(tmp_path, [sedan(10, 0, 7), sedan(20, 0, 8)], [sedan(11, 0, 7)])
     write_labels(tmp_path, [sedan(10, 0, 7)], [sedan(11, 0, 7)], sequence=2)
-    folder = tmp_path / "1/info_motion"
-    write.write_motion(folder, [], [(NAMES[0], "Sedan", 7, 1.25, -0.5)])
-    assert motion.read_velocities(folder / "objects.csv") == {
-        (NAMES[0], "Sedan", 7): (1.25, -0.5)
-    }
+    path = tmp_path / "1/info_motion/objects.csv"
+    text = f"{motion.OBJECT_HEADER}\n{NAMES[0]},Sedan,7,1.25,-0.5\n"
+    files.write_text(path, text)
+    assert motion.read_velocities(path) == {(NAMES[0], "Sedan", 7): (1.25, -0.5)}
     found = [frame.columns["velocity_mps"] for frame in KRadar(tmp_path)]
     np.testing.assert_allclose(found[0], [[1.25, -0.5], [np.nan, np.nan]])
     np.testing.assert_allclose(found[1], [[np.nan, np.nan]])
@@ -79,16 +79,15 @@ def test_velocities_of_the_file_are_used_instead(tmp_path):
         ("", "corrupted, not a table of velocities"),
         (
             "frame,class\n00004_00001,Sedan\n",
-            "expected frame,class,track_id,vx_mps,vy_m",
+            "expected 'frame,class,track_id,vx_mps,vy_m",
         ),
-        (",".join(motion.OBJECT_COLUMNS) + "\na,b,1,x,0\n", "convert string to float"),
+        (motion.OBJECT_HEADER + "\na,b,1,x,0\n", "convert string to float"),
     ],
 )
 def test_a_malformed_file_is_reported(tmp_path, text, message):
     write_labels(tmp_path, [sedan(10, 0, 7)], [sedan(11, 0, 7)])
     path = tmp_path / "1/info_motion/objects.csv"
-    path.parent.mkdir()
-    path.write_text(text)
+    files.write_text(path, text)
     data = KRadar(tmp_path)
     (problem,) = (text for kind, text in data.summary().problems if kind == "motion")
     assert problem.startswith(str(path))
@@ -114,6 +113,8 @@ def test_columns_of_own_readers_are_kept_with_their_boxes():
     (kept,) = LabelledFrames([frame], GRID).with_valid_boxes(["car"])
     assert kept.columns["weight_kg"].tolist() == [900]
     wrong = LabelledFrame(**fields, columns={"weight_kg": np.array([900])})
-    message = "frame 1/a: column 'weight_kg', number of rows is 1, expected one row for"
+    message = (
+        "frame 1/a: number of rows of column 'weight_kg' is 1, expected 2, one per"
+    )
     with pytest.raises(UserError, match=message):
         LabelledFrames([wrong], GRID).with_valid_boxes(["car"])
