@@ -99,7 +99,7 @@ def detect(
         reason = "without a label file, image or calibration"
         text += f"; {count['radar_only']} {reason}, from the radar only"
     if failed:
-        text += f"; {len(failed)} frames failed"
+        text += f"; {len(failed)} failed"
         for key, reason in itertools.islice(failed.items(), _MAX_LISTED):
             text += f"\nfailed {key}: {reason}"
     entry.echo_result(as_json, {**count, "failed": failed, "out": str(out)}, text)

@@ -24,7 +24,7 @@ from radejax.data.cameras import require_images
 from radejax.data.dataset import FrameSequence, LabelledFrame, find_reader
 from radejax.data.projection import decode
 from radejax.evaluation.analysis import box_errors
-from radejax.evaluation.boxes import roi_bounds, tables_from_frames
+from radejax.evaluation.boxes import roi_bounds, roi_name, tables_from_frames
 from radejax.evaluation.evaluation_set import Result
 from radejax.evaluation.report import STALE, Report, write_report
 from radejax.evaluation.results import (
@@ -344,7 +344,9 @@ def evaluate_run(
     workdir = files.as_path(workdir).absolute()
     if not saved.run:
         raise UserError(f"{workdir} is not a run: give a workdir of train.py")
-    usual = report_options(saved.config)
+    usual = dict(report_options(saved.config))
+    if usual["roi"] is not None:  # changes name the known regions
+        usual["roi"] = roi_name(usual["roi"])
     # A wrong change fails before labels are read, which takes long.
     options = report_options(saved.config, **changes)
     config, data = data_of_run(saved, other)
@@ -352,7 +354,7 @@ def evaluate_run(
     name += "" if split == "test" else f"_{files.as_path(split).stem}"
     name += "" if shuffle_images is None else "_shuffled"
     name += "" if step is None else f"_checkpoint_{step}"
-    name += name_of_changes(changes, dict(usual))
+    name += name_of_changes(changes, usual)
     run = run or workdir.name
     if step == "best" and other is None and split in (data.choosing_split, "all"):
         run += f" (chosen on the {data.choosing_split} split)"

@@ -119,7 +119,7 @@ def test_failed_frames_are_listed_with_exit_code_1(
     result = _run(*words)
     assert result.exit_code == 1
     first, *lines = result.stdout.splitlines()
-    assert first.endswith("30 frames failed")
+    assert first.endswith("; 30 failed")
     assert lines == [f"failed {k}: {x}" for k, x in list(failed.items())[:20]]
     result = _run(*words, "--json")
     assert result.exit_code == 1

@@ -140,6 +140,7 @@ def evaluated(
         ("test", {"bootstrap": 7, "figures": "pdf", "min_score": 0.05}, "", ""),
         ("test", {"roi": "wide", "step": 70}, "_checkpoint_70_roi_wide", ""),
         ("test", {"roi": None}, "_roi_None", ""),
+        ("test", {"roi": "narrow"}, "", ""),
         ("test", {"split": "lists/fog.txt"}, "_fog", ""),
         ("test", {"out": "elsewhere", "roi": "wide"}, None, ""),
     ],
