@@ -1,4 +1,4 @@
-"""Commands that evaluate runs and prediction files: `evaluate`, `score` and `compare`."""
+"""Commands that evaluate runs and prediction files: `evaluate`, `score`, `compare` and `runs`."""
 
 from __future__ import annotations
 
@@ -222,6 +222,22 @@ def compare(
     source, settings = _settings(runs[0], _given(options), bootstrap=2000)
     text, rows = compare_files(runs, out, source, settings)
     entry.echo_result(as_json, rows, text.rstrip("\n"))
+
+
+@click.command(cls=entry.Command)
+@click.argument("folder", type=entry.EXISTING)
+@entry.json_option
+def runs(folder: str, as_json: bool) -> None:
+    """List the runs in FOLDER with the config fields in which they differ.
+
+    AP is the metric that config.train.best_metric names, in the report of the run.
+
+    Example: radejax runs runs
+    """
+    from radejax.runs.listing import list_runs, table_of_runs
+
+    rows = list_runs(folder)
+    entry.echo_result(as_json, rows, table_of_runs(rows).rstrip("\n"))
 
 
 def _given(options: Mapping[str, object]) -> dict[str, Any]:

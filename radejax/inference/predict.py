@@ -63,6 +63,7 @@ def predict_dataset(
     images: CameraInputs | None = None,
     progress: bool = True,
     should_stop: Callable[[], bool] | None = None,
+    each_batch: Callable[[Batch], None] | None = None,
 ) -> Boxes:
     """Detect the objects in every frame on the devices of the detector.
 
@@ -79,6 +80,8 @@ def predict_dataset(
         progress: Show a progress bar.
         should_stop: Function that is called before every batch; returning True ends the
             detection.
+        each_batch: Function that is called with every batch with its labels, on the
+            devices of the detector.
 
     Returns:
         Boxes with scores, whose `frame` is the position in `frames`, sorted by frame, then
@@ -115,6 +118,8 @@ def predict_dataset(
         for batch in make_loader(table, options):
             if should_stop is not None and should_stop():
                 raise Stopped
+            if each_batch is not None:
+                each_batch(jax.tree.map(detector.put, batch))
             yield gather(detector.put(batch.frame)), batch
 
     progress = progress and is_main()

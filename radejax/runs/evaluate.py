@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import logging
 import math
@@ -10,16 +11,20 @@ import pathlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from flax.typing import VariableDict
 from jax.sharding import Mesh
+from jaxtyping import Float
 from matplotlib.figure import Figure
 
+from radejax import models
 from radejax.config import Config
 from radejax.core import devices, files
 from radejax.core.errors import UserError
 from radejax.core.files import JsonObject, PathLike
-from radejax.core.structures import Boxes
+from radejax.core.structures import Batch, Boxes, DetectionMaps
 from radejax.data.cameras import require_images
 from radejax.data.dataset import FrameSequence, LabelledFrame, find_reader
 from radejax.data.projection import decode
@@ -37,6 +42,7 @@ from radejax.inference.detector import Detector
 from radejax.inference.inputs import check_backbone
 from radejax.inference.predict import predict_dataset
 from radejax.inference.saved import SavedModel, Step, load_model
+from radejax.losses.detection import detection_loss
 from radejax.runs import figures
 from radejax.runs.data import Data, data_name, data_of_run
 from radejax.training.metric_writer import Scores
@@ -45,6 +51,8 @@ from radejax.visualize.draw import draw_frame, draw_scenes
 from radejax.visualize.style import Scene, save_figure
 
 _log = logging.getLogger(__name__)
+
+Losses = dict[str, Float[jax.Array, ""]]
 
 _STALE = ("camera_share.json", "figures", "scenes.*", "training.*")
 
@@ -119,9 +127,9 @@ class Evaluation:
         variables: VariableDict,
         should_stop: Callable[[], bool] | None = None,
     ) -> Scores:
-        """Evaluate the variables of a model during training.
+        """Evaluate the variables of a model during training: APs and loss.
 
-        Every process computes the same numbers.
+        Every process computes the same numbers, whose names begin with that of the split.
 
         Args:
             variables: Variables of the model.
@@ -131,7 +139,14 @@ class Evaluation:
         Raises:
             devices.Stopped: `should_stop` returned True.
         """
-        predictions = self.predict(variables, progress=False, should_stop=should_stop)
+        losses: list[Losses] = []
+        placed = self._detector.replace(variables=variables).variables
+        predictions = self.predict(
+            variables,
+            progress=False,
+            should_stop=should_stop,
+            each_batch=lambda batch: losses.append(self._sum_losses(placed, batch)),
+        )
         data = make_set(self._truth, predictions, self._table, self._options)
         # Without the frame table, there are no weathers and no intervals.
         aps = named_aps(compute_results(data, {}, self._options))
@@ -139,14 +154,45 @@ class Evaluation:
         best = next((ap for name, ap in aps.items() if name.startswith(main)), math.nan)
         shown = self._spread(self._config.logging.num_visualizations)
         drawn = devices.main_only(lambda: dict(self._figures(predictions, shown)))
-        values = {f"validation/{name}": ap for name, ap in aps.items()}
+        means = {
+            n: sum(float(x[n]) for x in losses) / len(self._frames) for n in losses[0]
+        }
+        values = {f"{self._split}/{name}": x for name, x in (means | aps).items()}
         if metrics := self._options.find_metrics():
             errors = box_errors(data, self._options.iou_thresholds[0], metrics)
             for name, cls in itertools.product(metrics, errors):
                 median = errors[cls][f"{name}_median"]
-                values[f"validation/{name}_median/{cls}"] = median
-        named = {f"validation/{name}": figure for name, figure in (drawn or {}).items()}
+                values[f"{self._split}/{name}_median/{cls}"] = median
+        named = {
+            f"{self._split}/{name}": figure for name, figure in (drawn or {}).items()
+        }
         return Scores(values, None if math.isnan(best) else best, named)
+
+    @functools.cached_property
+    def _sum_losses(self) -> Callable[[VariableDict, Batch], Losses]:
+        """Jitted sum over the frames of a batch of the loss of each frame and its terms.
+
+        Frames are summed one by one, so that the mean over a split depends neither on the
+        batches nor on the frames that pad them.
+        """
+        config = self._config
+        model = self._detector.model
+        grid = self._detector.grid
+        grid = models.map_grid(grid, model, config.data.azimuth_mapping)
+
+        def of_frame(maps: DetectionMaps, batch: Batch) -> Losses:
+            total, terms = detection_loss(maps, batch, grid, config.loss, config.decode)
+            names = (*config.loss.weights, "weighted_sum")
+            return {"loss": total} | {name: terms[name] for name in names}
+
+        def summed(variables: VariableDict, batch: Batch) -> Losses:
+            maps = model.apply(variables, *batch.model_inputs(), train=False)
+            one_by_one = jax.tree.map(lambda x: x[:, None], (maps, batch))
+            losses: Losses = jax.vmap(of_frame)(*one_by_one)
+            is_real = batch.frame >= 0
+            return {name: jnp.sum(x, where=is_real) for name, x in losses.items()}
+
+        return jax.jit(summed, out_shardings=self._detector.replicated)
 
     def report(
         self,

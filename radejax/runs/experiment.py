@@ -4,7 +4,8 @@ The workdir of a run contains
 
 config.json      the configuration without the paths of the data, which the checkpoints
                  contain; after the first checkpoint, only its logging and length may change
-run.json         versions, command, weights that the training started from
+run.json         versions, commits, hashes of own parts, command, weights that the training
+                 started from
 checkpoints/     the newest checkpoints and the best one, by step
 metrics.jsonl    losses by step; tensorboard/ has the same values
 evaluation/      metrics.json, metrics.csv, tables and figures of the last evaluation;
@@ -22,6 +23,8 @@ import hashlib
 import logging
 import pathlib
 import shlex
+import shutil
+import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -143,7 +146,7 @@ def run(
                 ", ".join(data.options.roots),
             )
         info = run_info(folder, init_from, init_partial)
-        info["input"] = data.usual_input
+        info |= {"input": data.usual_input, "parts": own_parts(config)}
         if devices.is_main():
             files.write_json(folder / "run.json", info)
         training_data = TrainingData(
@@ -153,6 +156,7 @@ def run(
             info=checkpoint_info(
                 config, grid, info, _invariants(frames, frozen_sha256)
             ),
+            keys=[frame.key for frame in frames],
         )
 
         # Model, state and training ----------------------------------------------------
@@ -225,12 +229,14 @@ class TrainingData:
         grid: Grid of the model's maps.
         info: Plain values that are saved in each checkpoint, see `checkpoint_info`. The
             value of "same" must be the same whenever the run continues.
+        keys: Keys of the frames by `Batch.frame` for messages; () names their indices.
     """
 
     batches: grain.DatasetIterator[Batch]
     steps_per_epoch: int
     grid: RadarGrid
     info: JsonObject
+    keys: Sequence[str] = ()
 
 
 def fit(
@@ -267,7 +273,7 @@ def fit(
 
     Raises:
         DataError: No checkpoint can be restored, or the loss or gradient was not finite in
-            too many consecutive steps.
+            too many consecutive steps or in most steps of the training.
         UserError: The run would continue with other data, the warm-up is too long, or no
             space is left on the disk.
     """
@@ -293,12 +299,19 @@ def fit(
 
         timed_batches = hooks.Throughput(data.batches, start)
         log = hooks.Log(config, data.steps_per_epoch, timed_batches, writer, bar)
-        check = hooks.CheckSkipped(config.train.max_skipped_steps)
+        log_every_steps = config.train.log_every_steps
+        check = hooks.CheckSkipped(
+            config.train.max_skipped_steps,
+            log_every_steps,
+            timed_batches,
+            data.keys,
+            int(state.num_skipped),
+            int(state.num_skipped_in_row),
+        )
         external = models.external_parts(model)
         save = hooks.Save(checkpoints, data.batches, data.info, check, external, start)
         due = functools.partial(hooks.every, num_steps)
-        log_every_steps = config.train.log_every_steps
-        called: list[Hook] = [timed_batches, bar, due(log_every_steps, log)]
+        called: list[Hook] = [timed_batches, bar, due(log_every_steps, log), check]
         if validate is not None:
 
             def evaluate(step: int, state: TrainState, metrics: Metrics) -> None:
@@ -316,7 +329,6 @@ def fit(
         for place in config.train.hooks:
             own: hooks.OwnHook = find_function(place, "config.train.hooks")
             called.append(hooks.logged(own, writer))
-        called.append(due(log_every_steps, check))
         called.append(due(config.train.checkpoint_every_steps, save))
         if profile is not None:
             shown = config.logging.profile_steps
@@ -335,6 +347,8 @@ def fit(
         is_finished = last >= num_steps and not should_stop()
         save(last, state, {})
         checkpoints.wait()
+        if is_finished:
+            check.check_total(num_steps)
     return state, is_finished
 
 
@@ -437,7 +451,7 @@ def run_info(
     init_from: PathLike | None = None,
     init_partial: PathLike | None = None,
 ) -> JsonObject:
-    """Returns the versions, device, command and starting weights of a run as plain values.
+    """Returns versions, commits, device, command and starting weights of a run as plain values.
 
     Args:
         workdir: Workdir of the run.
@@ -453,12 +467,48 @@ def run_info(
         for name, one in given.items()
     }
     versions = {"radejax": __version__, "jax": jax.__version__}
+    package = pathlib.Path(__file__).parents[2]
+    is_checkout = (package / ".git").exists()
     return {
         **start,
         "versions": {**versions, "python": sys.version.split()[0]},
+        "commit": _commit(pathlib.Path.cwd()),
+        "radejax_commit": _commit(package) if is_checkout else None,
         "device": str(jax.devices()[0].device_kind),
         "command": shlex.join(sys.argv),
     }
+
+
+def _commit(folder: pathlib.Path) -> str | None:
+    """Returns the git commit of a folder, followed by "-dirty" if tracked files differ.
+
+    The result is None without a commit or without git.
+    """
+    if shutil.which("git") is None:
+        return None
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
+    return done.stdout.strip() or None
+
+
+def own_parts(config: Config) -> dict[str, str]:
+    """Returns the SHA-256 of the file of each part that a config names as module:Object.
+
+    The modules have to be imported before, see `Config.check_imports`.
+    """
+    names = [
+        as_tuples(value) for name, value in config.fields() if name != "data.roots"
+    ]
+    names = [
+        x for value in names for x in (value if isinstance(value, tuple) else [value])
+    ]
+    found = {}
+    for name in names:
+        module = sys.modules.get(str(name).partition(":")[0])
+        path = getattr(module, "__file__", None)
+        if isinstance(name, str) and ":" in name and path is not None:
+            found[name] = hashlib.sha256(pathlib.Path(path).read_bytes()).hexdigest()
+    return found
 
 
 def checkpoint_info(

@@ -7,9 +7,11 @@ it is called.
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import dataclasses
 import logging
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
@@ -17,6 +19,7 @@ import grain
 import jax
 import numpy as np
 import tqdm
+from jaxtyping import Int
 
 from radejax.config import Config
 from radejax.core import devices
@@ -33,6 +36,8 @@ Hook = Callable[[int, TrainState, Metrics], None]
 
 OwnHook = Callable[[int, TrainState, Metrics], Mapping[str, float] | None]
 """Function of `config.train.hooks`, which may return values to be logged."""
+
+STEPS_IN_FLIGHT = 2  # more steps would only keep more batches in memory
 
 
 def every(num_steps: int, count: int, hook: Hook) -> Hook:
@@ -84,7 +89,12 @@ class Throughput:
     Args:
         batches: Endless iterator.
         start_step: Number of steps that were taken before.
+
+    Attributes:
+        frame: Indices of the frames of the last batch of this process.
     """
+
+    frame: Int[np.ndarray, " B"]
 
     def __init__(self, batches: Iterator[Batch], start_step: int) -> None:
         self._batches = batches
@@ -100,6 +110,7 @@ class Throughput:
         batch = next(self._batches)
         if all(x.is_ready() for x in jax.tree.leaves(self._metrics)):
             self._waited_s += time.perf_counter() - started
+        self.frame = np.asarray(batch.frame)
         return batch
 
     def __call__(self, step: int, state: TrainState, metrics: Metrics) -> None:
@@ -182,30 +193,77 @@ class Log:
 
 @dataclasses.dataclass
 class CheckSkipped:
-    """Hook that warns of new steps that were skipped.
+    """Hook that reports steps that were skipped, and ends a training that diverges.
 
-    A step is skipped if its loss or gradient is not finite.
+    A step is skipped if its loss or gradient is not finite. Only steps that the loop has
+    waited for are examined, so that the devices stay busy.
 
     Attributes:
         limit: Number of consecutive skipped steps above which `DataError` is raised.
-        num_reported: Number of skipped steps that were reported.
+        log_every_steps: Least number of steps between two warnings.
+        throughput: Iterator over the batches of the steps.
+        keys: Keys of the frames by their index; indices are reported without them.
+        num_skipped: Number of steps skipped up to the last one that was examined.
+        num_in_row: Number of consecutive steps skipped up to the same step.
     """
 
     limit: int
-    num_reported: int = 0
+    log_every_steps: int
+    throughput: Throughput
+    keys: Sequence[str]
+    num_skipped: int
+    num_in_row: int
+
+    def __post_init__(self) -> None:
+        self._pending = collections.deque[tuple[int, Metrics, np.ndarray]]()
+        self._next_warning = 0
+        self._first = ""  # description of the first skipped step of the current row
 
     def __call__(self, step: int, state: TrainState, metrics: Metrics) -> None:
-        if (in_row := int(state.num_skipped_in_row)) > self.limit:
+        self._pending.append((step, metrics, self.throughput.frame))
+        if len(self._pending) > STEPS_IN_FLIGHT:
+            self._examine(*self._pending.popleft())
+
+    def finish(self) -> None:
+        """Examines all steps that were taken."""
+        while self._pending:
+            self._examine(*self._pending.popleft())
+
+    def check_total(self, num_steps: int) -> None:
+        """Raises `DataError` if most of the steps of a whole training were skipped."""
+        if 2 * self.num_skipped > num_steps:
             raise DataError(
-                f"loss or gradient was not finite in {in_row} steps in a row (limit "
-                f"config.train.max_skipped_steps={self.limit})"
+                f"{self.num_skipped} of {num_steps} steps were skipped because loss or "
+                f"gradient was not finite, so that the model is hardly trained{self._first}"
             )
-        if (skipped := int(state.num_skipped)) > self.num_reported:
-            _log.warning(
-                "%d steps so far were skipped because loss or gradient was not finite",
-                skipped,
+
+    def _examine(
+        self, step: int, metrics: Metrics, frame: Int[np.ndarray, " B"]
+    ) -> None:
+        skipped = int(metrics["skipped"])
+        if skipped == self.num_skipped:
+            self.num_in_row = 0
+            return
+        self.num_skipped = skipped
+        self.num_in_row += 1
+        values = {name: float(np.asarray(x)) for name, x in metrics.items()}
+        wrong = [f"{name} {x}" for name, x in values.items() if not math.isfinite(x)]
+        keys = [self.keys[i] if self.keys else str(i) for i in frame.tolist()]
+        text = f"step {step} has {', '.join(wrong)}; its frames are {', '.join(keys)}"
+        if self.num_in_row == 1 or not self._first:
+            self._first = (
+                f": {text}. Look at these frames, lower config.train.learning_rate, or "
+                "find the operation with JAX_DEBUG_NANS=1 (docs/debugging.md)"
             )
-        self.num_reported = skipped
+        if self.num_in_row > self.limit:
+            raise DataError(
+                f"loss or gradient was not finite in {self.num_in_row} steps in a row (limit "
+                f"config.train.max_skipped_steps={self.limit}){self._first}"
+            )
+        if step >= self._next_warning:
+            self._next_warning = step + self.log_every_steps
+            total = f"{skipped} so far" if skipped > 1 else "the first one"
+            _log.warning("a step was skipped (%s): %s", total, text)
 
 
 @dataclasses.dataclass
@@ -216,7 +274,7 @@ class Save:
         checkpoints: Checkpoints of the run.
         batches: Iterator whose next batch belongs to the saved state.
         info: Plain values that are saved with each state.
-        check: Hook that is called before a state is saved.
+        check: Hook whose `finish` is called before a state is saved.
         external: Parts of the model whose frozen parameters are not saved.
         saved_step: Step of the state that was saved or restored last.
     """
@@ -224,7 +282,7 @@ class Save:
     checkpoints: Checkpoints
     batches: grain.DatasetIterator[Batch]
     info: Mapping[str, object]
-    check: Hook
+    check: CheckSkipped
     external: Sequence[str]
     saved_step: int
 
@@ -246,7 +304,7 @@ class Save:
         """
         if step == self.saved_step:
             return
-        self.check(step, state, metrics)
+        self.check.finish()
         kept = state.without(self.external)
         self.checkpoints.save(step, kept, self.batches, info=self.info, best=best)
         self.saved_step = step

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import contextlib
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
@@ -19,12 +20,10 @@ from radejax.core import devices, files
 from radejax.core.errors import UserError
 from radejax.core.structures import Batch
 from radejax.training.checkpoints import Checkpoints
-from radejax.training.hooks import Hook
+from radejax.training.hooks import STEPS_IN_FLIGHT, Hook
 from radejax.training.step import Metrics, Step, TrainState, run_keys
 
 _log = logging.getLogger(__name__)
-
-_STEPS_IN_FLIGHT = 2  # more steps would only keep more batches in memory
 
 PlacedStep = Callable[[TrainState, Batch], tuple[TrainState, Metrics]]
 
@@ -59,7 +58,7 @@ def train(
         state, metrics = step(state, next(batches))
         number += 1
         in_flight.append(metrics)
-        if len(in_flight) > _STEPS_IN_FLIGHT:
+        if len(in_flight) > STEPS_IN_FLIGHT:
             jax.block_until_ready(in_flight.popleft())
         for hook in hooks:
             hook(number, state, metrics)
@@ -84,16 +83,25 @@ def place_step(step: Step, state: TrainState, mesh: Mesh, seed: int) -> PlacedSt
 
     def placed(state: TrainState, batch: Batch) -> tuple[TrainState, Metrics]:
         on_devices = devices.put_batch(batch, mesh)
-        with jax.transfer_guard("allow" if _is_debugging() else "disallow"):
+        with _settings_of_debugging():
             return jitted(state, on_devices, rng)
 
     return placed
 
 
-def _is_debugging() -> bool:
-    """Returns whether JAX runs operations one at a time, which transfers their arguments."""
-    names = ("jax_debug_nans", "jax_debug_infs", "jax_disable_jit")
-    return any(jax.config.values[name] for name in names)
+@contextlib.contextmanager
+def _settings_of_debugging() -> Iterator[None]:
+    """Forbids implicit transfers, unless JAX runs operations one at a time for debugging.
+
+    A global `jax_debug_nans` or `jax_debug_infs` is also set in this thread. Otherwise JAX
+    0.10 drops it: while it traces the step, it turns the setting off and not on again.
+    """
+    settings = jax.config.values
+    is_nans, is_infs = settings["jax_debug_nans"], settings["jax_debug_infs"]
+    is_debugging = is_nans or is_infs or settings["jax_disable_jit"]
+    transfers = jax.transfer_guard("allow" if is_debugging else "disallow")
+    with transfers, jax.debug_nans(is_nans), jax.debug_infs(is_infs):
+        yield
 
 
 def restore_or_initialize(

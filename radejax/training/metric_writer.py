@@ -7,6 +7,7 @@ import hashlib
 import json
 import math
 import pathlib
+import time
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
@@ -56,6 +57,7 @@ class MetricWriter:
 
     def __init__(self, folder: pathlib.Path, config: Config, start_step: int) -> None:
         self._path = folder / "metrics.jsonl"
+        self._started_s = time.perf_counter()
         self._board: tensorboardX.SummaryWriter | None = None
         self._wandb: wandb.Run | None = None
         if not devices.is_main():
@@ -75,13 +77,16 @@ class MetricWriter:
         values: Mapping[str, float],
         figures: Mapping[str, Figure] | None = None,
     ) -> None:
-        """Writes values and figures by name."""
+        """Writes values and figures by name, and minutes since the writer was created."""
         if self._board is None:
             return
         with files.disk_full(self._path):
             record = {n: x if math.isfinite(x) else None for n, x in values.items()}
+            minutes = round((time.perf_counter() - self._started_s) / 60, 4)
             with self._path.open("a") as file:
-                file.write(json.dumps({"step": step, **record}) + "\n")
+                file.write(
+                    json.dumps({"step": step, "minutes": minutes, **record}) + "\n"
+                )
             self._board.flush()  # raises an error if the writer thread failed
             for name, value in values.items():
                 self._board.add_scalar(name, value, step)

@@ -103,7 +103,8 @@ def draw_training(
 
     Args:
         series: `(step [N], value [N])` by name, as returned by `read_metrics`.
-        keys: Names of the series to show.
+        keys: Names of the series to show. Those of a split, such as `validation/focal`,
+            are drawn in the panel of `focal`.
         title: Title of the figure.
     """
     figure = new_figure(4.0 * len(keys), 3.4, layout="constrained")
@@ -113,6 +114,9 @@ def draw_training(
         smooth = moving_mean(value, max(1, round(0.05 * value.size)))
         ax.plot(step, value, color=color, alpha=0.3, lw=0.8, label="logged")
         ax.plot(step, smooth, color=color, lw=1.8, label="moving mean")
+        for name in (name for name in series if name.endswith(f"/{key}")):
+            split = name.removesuffix(f"/{key}")
+            ax.plot(*series[name], color="black", marker=".", lw=1.2, label=split)
         ax.set(xlabel="step", title=key)
         finite = value[np.isfinite(value)]
         if finite.size and finite.min() > 0 and finite.max() > 20 * finite.min():
