@@ -22,6 +22,10 @@ if TYPE_CHECKING:
 MODEL = pathlib.Path(__file__).with_name("demo_model")
 """Model of the quickstart with seed 0; docs/detector.md lists the commands that made it."""
 
+_workdir = click.option(
+    "--workdir", type=entry.EXISTING, help="Run whose detections are drawn."
+)
+
 
 @click.command(cls=entry.Command)
 @click.argument("name", metavar="[FRAME]", default="")
@@ -45,6 +49,7 @@ MODEL = pathlib.Path(__file__).with_name("demo_model")
     default="narrow",
     help="Region of interest to draw.",
 )
+@_workdir
 @entry.max_frames
 def overlay(
     name: str,
@@ -53,6 +58,7 @@ def overlay(
     slices: bool,
     lidar: bool,
     roi: str,
+    workdir: str | None,
     max_frames: int | None,
     **part: Any,
 ) -> None:
@@ -79,6 +85,8 @@ def overlay(
         raise UserError(f"frame {name!r}, expected sequence/radar_lidar: 1/00033_00001")
     if slices and lidar:
         raise UserError("--slices shows no LiDAR points: leave out --lidar or --slices")
+    if slices and workdir:
+        raise UserError("--slices shows no detections: leave out --workdir or --slices")
     frames = radejax.KRadar(roots, visibility=None, **part)
     if not len(frames):
         raise UserError("no frames of these sequences and weathers")
@@ -92,13 +100,16 @@ def overlay(
             f"no frame {frame_name} in sequence {sequence}; there are "
             f"{frames[0].name} to {frames[-1].name}"
         )
+    detector = _detector(frames, workdir)
     is_animation = out.suffix.lower() == ".gif"
     found = found[: max_frames if is_animation else 1]
     if is_animation:
         shown = tqdm.tqdm(found, "draw", unit="frame")
-        animate((_draw(frames, frame, slices, lidar, roi) for frame in shown), out)
+        animate(
+            (_draw(frames, frame, slices, lidar, roi, detector) for frame in shown), out
+        )
     else:
-        save_figure(_draw(frames, found[0], slices, lidar, roi), out)
+        save_figure(_draw(frames, found[0], slices, lidar, roi, detector), out)
     click.echo(f"drew {out}{'' if slices else _undrawn(found)}")
 
 
@@ -115,7 +126,12 @@ def _undrawn(frames: Sequence[Frame]) -> str:
 
 
 def _draw(
-    frames: radejax.KRadar, frame: Frame, slices: bool, lidar: bool, roi: str
+    frames: radejax.KRadar,
+    frame: Frame,
+    slices: bool,
+    lidar: bool,
+    roi: str,
+    detector: radejax.Detector | None,
 ) -> Figure:
     """Draws one frame: slices of the projection, or the radar map and camera image.
 
@@ -123,12 +139,12 @@ def _draw(
         FileNotFoundError: The frame has neither a tensor nor a projection, or no LiDAR scan
             is there that is to be drawn.
     """
-    from radejax.core.structures import ROIS
     from radejax.data.kradar.points import read_lidar
     from radejax.visualize.draw import draw_slices
 
-    projection = frame.read_projection(frames.grid)
-    scene = radejax.frame_scene(frame, projection, frames.grid, roi=ROIS.get(roi))
+    grid = frames.grid if detector is None else detector.grid
+    region = None if roi == "none" else roi
+    scene = _scene(frame, grid, detector, roi=region)
     if lidar:
         points_m = read_lidar(frames.lidar_path(frame)) + frame.radar_from_lidar_m
         scene = dataclasses.replace(scene, lidar_m=points_m)
@@ -140,7 +156,7 @@ def _draw(
 @entry.out_file("recording.rrd", "File of the recording.")
 @entry.labelled_frames
 @entry.camera_calibration
-@click.option("--workdir", type=entry.EXISTING, help="Run whose detections are drawn.")
+@_workdir
 @entry.max_frames
 def view(
     roots: tuple[str, ...],
@@ -158,7 +174,6 @@ def view(
     """
     import tqdm
 
-    from radejax.data.kradar.reduced import check_release
     from radejax.visualize.recordings import write_recording
 
     frames = radejax.KRadar(roots, visibility=None, **part)
@@ -168,10 +183,7 @@ def view(
             f"no radar tensor or projection for any of {len(frames)} labelled frames"
         )
     shown = complete[:max_frames]
-    detector = None if workdir is None else radejax.Detector.from_workdir(workdir)
-    if detector is not None:
-        release = detector.saved.config.data.release
-        check_release(frames.release, release, f"radar data in {', '.join(roots)}")
+    detector = _detector(frames, workdir)
     bar = tqdm.tqdm(shown, desc="record", unit="frame")
     grid = frames.grid if detector is None else detector.grid
     write_recording(viewer_scenes(bar, grid, detector), out)
@@ -191,17 +203,39 @@ def viewer_scenes(
     All frames must have radar data. With a detector, the scenes contain its predictions.
     """
     for frame in frames:
-        projection = frame.read_projection(grid)
-        time_s = frame.header.timestamp_s
-        scene = radejax.frame_scene(frame, projection, grid, time_s=time_s)
-        if detector is not None:
-            image = camera = None
-            if detector.takes_camera and scene.camera is not None:
-                image = [frame.camera_path]
-                camera = scene.camera
-            found = detector(projection, image, camera).to_boxes()
-            scene = dataclasses.replace(scene, predictions=found)
-        yield scene
+        yield _scene(frame, grid, detector, time_s=frame.header.timestamp_s)
+
+
+def _detector(frames: radejax.KRadar, workdir: str | None) -> radejax.Detector | None:
+    """Returns the detector of a run that was trained on this release, or None."""
+    from radejax.data.kradar.reduced import check_release
+
+    if workdir is None:
+        return None
+    detector = radejax.Detector.from_workdir(workdir)
+    release = detector.saved.config.data.release
+    check_release(frames.release, release, "radar data to draw")
+    return detector
+
+
+def _scene(
+    frame: Frame,
+    grid: radejax.RadarGrid,
+    detector: radejax.Detector | None,
+    **fields: Any,
+) -> radejax.Scene:
+    """Reads a frame and returns its scene, with detections if there is a detector."""
+    projection = frame.read_projection(grid)
+    scene = radejax.frame_scene(frame, projection, grid, **fields)
+    if detector is None:
+        return scene
+    image = camera = None
+    if detector.takes_camera and scene.camera is not None:
+        image = [frame.camera_path]
+        camera = scene.camera
+    threshold = detector.decode_options.score_threshold
+    found = detector(projection, image, camera).to_boxes()
+    return dataclasses.replace(scene, predictions=found, score_threshold=threshold)
 
 
 @click.command(cls=entry.Command)

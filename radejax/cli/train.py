@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import logging
+import pathlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -70,6 +71,11 @@ class _Command(entry.Command):
 )
 @click.option("--profile", help="Folder for a trace of a few training steps.")
 @click.option(
+    "--draw-samples",
+    type=entry.FILE,
+    help="Draw samples as the network gets them to this file instead of training.",
+)
+@click.option(
     "--distributed",
     is_flag=True,
     help="One of several processes, as Slurm starts them.",
@@ -91,6 +97,7 @@ def train(
     init_partial: str | None,
     seeds: tuple[int, ...] | None,
     profile: str | None,
+    draw_samples: pathlib.Path | None,
     distributed: bool,
     **data: Any,
 ) -> None:
@@ -107,6 +114,8 @@ def train(
     from radejax.config import config_name, load_config, with_texts
     from radejax.core.devices import end_with_others
     from radejax.runs.experiment import run, run_seeds
+    from radejax.runs.figures import draw_training_samples
+    from radejax.visualize.style import figure_format, save_figure
 
     place = [data.pop(n) for n in ("coordinator", "num_processes", "process_id")]
     is_distributed = distributed or place != [None] * 3
@@ -120,6 +129,11 @@ def train(
         settings = with_texts(load_config(config), fields)
         data["sequences"] = data.pop("sequence_numbers")
         settings = settings.replace(data={name: x for name, x in data.items() if x})
+        if draw_samples is not None:
+            figure_format(draw_samples)  # checks the ending before data are prepared
+            save_figure(draw_training_samples(settings), draw_samples)
+            click.echo(f"drew {draw_samples}")
+            return
         start = functools.partial(run, settings, workdir)
         if seeds:
             start = functools.partial(run_seeds, settings, workdir, seeds)

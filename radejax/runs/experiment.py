@@ -496,12 +496,10 @@ def own_parts(config: Config) -> dict[str, str]:
 
     The modules have to be imported before, see `Config.check_imports`.
     """
-    names = [
-        as_tuples(value) for name, value in config.fields() if name != "data.roots"
-    ]
-    names = [
-        x for value in names for x in (value if isinstance(value, tuple) else [value])
-    ]
+    values = (value for name, value in config.fields() if name != "data.roots")
+    names = (
+        x for value in values for x in (value if type(value) is tuple else [value])
+    )
     found = {}
     for name in names:
         module = sys.modules.get(str(name).partition(":")[0])

@@ -1,4 +1,4 @@
-"""Figures of a run: frames with boxes, loss curves, and the camera's weight in the fusion."""
+"""Figures of a run: frames, training samples, and the camera's weight in the fusion."""
 
 from __future__ import annotations
 
@@ -6,21 +6,30 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax.typing import VariableDict
 from jaxtyping import Float, PyTree
+from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
+from radejax import models
+from radejax.config import Config
 from radejax.core.files import JsonObject
-from radejax.core.structures import Array, Boxes
+from radejax.core.structures import Array, Batch, Boxes
 from radejax.data.cameras import front_view
 from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.pipeline import read_sample, sample_keys
 from radejax.data.projection import decode
+from radejax.evaluation.boxes import roi_bounds
 from radejax.evaluation.results import condition_masks
+from radejax.geometry.boxes import boxes7_from_8
+from radejax.geometry.camera import Camera, CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
+from radejax.losses.focal import gaussian_heatmap
 from radejax.models.radenet import RadeNet
-from radejax.runs.data import Data
+from radejax.runs.data import Data, located, open_data
+from radejax.visualize.draw import draw_samples
 from radejax.visualize.style import Scene
 
 T = TypeVar("T")
@@ -35,14 +44,83 @@ def frame_scene(
         frame: Frame to draw.
         projection: Projection `[R, A, D+E]` of the frame.
         grid: Grid of the projection.
-        **fields: Other fields of `Scene`, such as `predictions` and `roi`.
+        **fields: Other fields of `Scene`, such as `predictions` and `roi`, which may also
+            be "narrow" or "wide".
     """
     image, camera = front_view(frame)
     simulated = ", simulated" if frame.is_simulated else ""
     title = f"sequence {frame.sequence}, frame {frame.name}, {frame.weather}{simulated}"
     given = {"image": image, "camera": camera, "title": title, **fields}
+    given["roi"] = roi_bounds(given.get("roi"))
     truth = Boxes.one_frame(frame.boxes, frame.classes)
     return Scene(projection, grid, ground_truth=truth, **given)
+
+
+def draw_training_samples(config: Config, count: int = 4) -> Figure:
+    """Draw the first frames of a training as the network gets them.
+
+    Args:
+        config: Config of the run. Data are simulated and preprocessed as for a run.
+        count: Largest number of frames of the first batch to draw.
+
+    Raises:
+        UserError: The config does not fit the data, see `open_data`.
+    """
+    config.check_imports()
+    config = located(config)
+    data = open_data(config)
+    frames = data.split("train")
+    batch = next(data.training_batches(frames, config.train, config.seed))
+    model = models.build(config.model, config.data.num_frames)
+    grid = models.map_grid(data.records.grid, model, config.data.azimuth_mapping)
+    samples = []
+    for row, index in enumerate(batch.frame[:count].tolist()):
+        sample: Batch = jax.tree.map(lambda x, row=row: np.asarray(x[row]), batch)
+        target = gaussian_heatmap(
+            jnp.asarray(sample.boxes),
+            sample.classes,
+            jnp.asarray(sample.is_valid),
+            grid,
+            num_classes=len(config.classes),
+            sigma_mode=config.loss.heatmap_sigma_mode,
+            sigma_bins=config.loss.heatmap_sigma_bins,
+        )
+        scene = _input_scene(sample, data, roi_bounds(config.evaluation.roi))
+        record = decode(data.records[frames[index].key])
+        frame = frame_scene(frames[index], record, scene.grid, roi=scene.roi)
+        samples.append((frame, scene, np.asarray(target).max(-1)))
+    return draw_samples(samples, grid)
+
+
+def _input_scene(sample: Batch, data: Data, roi: tuple[float, ...] | None) -> Scene:
+    """Return the scene of one frame of a batch, without the axis of the batch."""
+    grid = data.records.grid
+    # The channels of several frames are reduced to their maximum, which is drawn.
+    power = decode(np.asarray(sample.projection)).max(-1, keepdims=True)
+    rows = sample.is_valid
+    names = np.array(data.classes)[sample.classes[rows]]
+    truth = Boxes.one_frame(boxes7_from_8(np.asarray(sample.boxes)[rows]), names)
+    image = camera = None
+    if sample.image is not None and sample.image.dtype == np.uint8:
+        image = sample.image
+        if isinstance(sample.camera, Camera) and sample.camera.is_valid:
+            of = sample.camera
+            rotation, shift_m = np.split(np.asarray(of.cam_from_ego), [3], axis=1)
+            width, height = map(int, of.size_px)
+            lens = np.asarray(of.intrinsics), np.asarray(of.distortion)
+            no_shift_m = np.zeros(3)  # as the rotation is from the radar frame
+            camera = CameraCalibration(
+                *lens, rotation, shift_m[:, 0], width, height, no_shift_m
+            )
+    return Scene(
+        np.broadcast_to(power, grid.projection_shape),
+        grid,
+        ground_truth=truth,
+        roi=roi,
+        image=image,
+        camera=camera,
+        title="input of the network",
+    )
 
 
 def fullest_of_weathers(frames: FrameSequence) -> dict[str, int]:

@@ -261,6 +261,42 @@ def draw_scenes(scenes: Sequence[Scene]) -> Figure:
     return figure
 
 
+def draw_samples(
+    samples: Sequence[tuple[Scene, Scene, Float[np.ndarray, "R A"]]], grid: RadarGrid
+) -> Figure:
+    """Draw samples of a training, one per row, as the network gets them.
+
+    Args:
+        samples: For each sample the frame as it was recorded, the input with its boxes after
+            augmentation, and the target heatmap.
+        grid: Grid of the target heatmaps, padded if they are.
+    """
+    has_image = any(scene.image is not None for _, scene, _ in samples)
+    figure = style.new_figure(13.5 + 5.5 * has_image, 5.0 * len(samples))
+    layout = {"wspace": 0.35, "left": 0.06, "right": 0.97, "bottom": 0.04, "top": 0.95}
+    ratios = [1, 1, 1, 1.5][: 3 + has_image]
+    axes = figure.subplots(
+        len(samples),
+        len(ratios),
+        squeeze=False,
+        width_ratios=ratios,
+        gridspec_kw=layout,
+    )
+    for row, (frame, scene, target) in zip(axes, samples, strict=True):
+        for ax, shown in zip(row, (frame, scene), strict=False):
+            _draw_ground(shown, ax=ax)
+        draw_map(target, grid, ax=row[2], extent=_extent_m(scene.grid, scene.roi))
+        titles = frame.title, scene.title, "target heatmap, max over classes"
+        for ax, title in zip(row, titles, strict=False):
+            ax.set_title(title, fontsize=9)
+        if scene.image is not None:
+            _draw_view(row[3], scene)
+            row[3].set_title("image that the network gets", fontsize=9)
+        for ax in row[4 if scene.image is not None else 3 :]:
+            ax.set_axis_off()
+    return figure
+
+
 def _draw_view(ax: Axes, scene: Scene, *, show_labels: bool = True) -> None:
     """Draw the camera image, and the boxes on it if a calibration is given."""
     assert scene.image is not None
