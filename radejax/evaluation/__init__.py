@@ -8,8 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from radejax.core.structures import CLASSES
-from radejax.evaluation.boxes import AnyBoxes, AnyColumns, Roi
+from radejax.evaluation.boxes import (
+    AnyBoxes,
+    AnyColumns,
+    Roi,
+    columns_of_boxes,
+    with_ids,
+)
 from radejax.evaluation.evaluation_set import SPACES, EvaluationSet, Result, mean_ap
 from radejax.evaluation.protocols import PROTOCOLS
 
@@ -33,7 +41,8 @@ def evaluate(
     """Computes the average precision per class, space and IoU threshold in one protocol.
 
     Args:
-        ground_truth: `Boxes`, or columns frame `[N]` int, box `[N, 7]` x, y, z, l, w, h,
+        ground_truth: `Boxes`, or columns frame `[N]` (ids, or keys such as
+            "1/00033_00001" as in the files of a report), box `[N, 7]` x, y, z, l, w, h,
             yaw (meters, radians, radar frame, full extents, z at mid-height) and cls
             `[N]` names. The results of K-Radar's protocols depend on the order of boxes
             within each frame.
@@ -71,9 +80,21 @@ def evaluate(
         >>> [r.ap for r in evaluate(truth, found, classes=["Sedan"], protocol="all_point")]
         [100.0, 100.0]
     """
+    truth, found = map(columns_of_boxes, (ground_truth, predictions))
+    named = [
+        x["frame"]
+        for x in (truth, found)
+        if x.get("frame", np.zeros(0)).dtype.kind == "U"
+    ]
+    if named and frames is None:
+        keys = np.unique(np.concatenate(named))
+        frames = {"frame": np.arange(len(keys)), "name": keys}
+    if named:
+        truth = with_ids(truth, frames, "ground truth")
+        found = with_ids(found, frames, "predictions")
     data = EvaluationSet(
-        ground_truth,
-        predictions,
+        truth,
+        found,
         classes=classes,
         frames=frames,
         roi=roi,

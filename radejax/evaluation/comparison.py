@@ -29,9 +29,16 @@ from scipy.special import stdtrit
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.core.files import JsonObject, PathLike
+from radejax.core.structures import Boxes
 from radejax.evaluation import protocols, report
 from radejax.evaluation.analysis import distance_sets
-from radejax.evaluation.boxes import Columns
+from radejax.evaluation.boxes import (
+    Columns,
+    frame_ids,
+    frame_keys,
+    frame_positions,
+    take,
+)
 from radejax.evaluation.evaluation_set import SPACES, EvaluationSet
 from radejax.evaluation.files import Source, load, report_folders, stored_options
 from radejax.evaluation.results import (
@@ -348,7 +355,8 @@ def compare_files(
     stored = (stored_options(seed).get("min_score", 0) for seed in seeds)
     options = options.replace(min_score=max(options.min_score, *stored))
     names = [str(path) for path in paths]
-    (first, frames), *others = [_load_run(run, source, options) for run in folders]
+    first, frames = _load_run(folders[0], source, options)
+    others = [_load_run(run, source, options, frames) for run in folders[1:]]
     built = []
     rows = []
     for name, (sets, _) in zip(names[1:], others, strict=True):
@@ -367,12 +375,25 @@ def compare_files(
 
 
 def _load_run(
-    folders: Mapping[str, pathlib.Path], source: Source, options: ReportOptions
+    folders: Mapping[str, pathlib.Path],
+    source: Source,
+    options: ReportOptions,
+    like: Columns | None = None,
 ) -> tuple[dict[str, EvaluationSet], Columns]:
-    """Returns the evaluation sets of the seeds of a run, and its frame table."""
+    """Returns the evaluation sets of the seeds of a run, and its frame table.
+
+    Args:
+        folders: Report of each seed.
+        source: Source of the ground truth.
+        options: Settings of the evaluation.
+        like: Frame table whose ids and order of the frames are taken, or None.
+    """
     sets: dict[str, EvaluationSet] = {}
     for name, path in folders.items():
         truth, found, frames, _ = load(path, source, options.classes)
+        if like is not None:
+            truth, found, frames = _renumbered(truth, found, frames, like)
+        like = frames
         if "sequence" not in frames:
             raise UserError(
                 f"{path}: a comparison resamples sequences, and the frame table has no "
@@ -380,3 +401,28 @@ def _load_run(
             )
         sets[name] = make_set(truth, found, frames, options)
     return sets, frames
+
+
+def _renumbered(
+    truth: Boxes, found: Boxes, frames: Columns, like: Columns
+) -> tuple[Boxes, Boxes, Columns]:
+    """Returns boxes and frame table with the frame ids and the order of another table.
+
+    Frames are identified by their keys: ids differ if a run was evaluated on a part.
+    """
+    keys, expected = frame_keys(frames), frame_keys(like)
+    if other := sorted(set(keys) ^ set(expected)):
+        raise UserError(
+            f"the runs have different frames ({len(expected)} and {len(keys)}), such as "
+            f"{other[0]}: choose common ones by --sequences, --weather or --split"
+        )
+    ids = dict(zip(expected, frame_ids(like), strict=True))
+    new = np.array([ids[key] for key in keys], np.int64)
+    truth, found = (
+        dataclasses.replace(
+            table, frame=new[frame_positions(table.frame, frame_ids(frames), "boxes")]
+        )
+        for table in (truth, found)
+    )
+    order = [keys.index(key) for key in expected]
+    return truth, found, take({**frames, "frame": new}, np.array(order, np.int64))

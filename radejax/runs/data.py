@@ -412,8 +412,8 @@ def data_of_run(
         changes: Fields of `config.data` to replace.
 
     Raises:
-        UserError: The run has no data and none are given, or the data are of another
-            radar grid.
+        UserError: The run has no data and none are given, or the Doppler or elevation bins
+            of the data are not those of the model. Another range or azimuth axis is warned of.
         FileNotFoundError: A folder is missing.
     """
     own = saved.config.data.roots
@@ -431,8 +431,15 @@ def data_of_run(
     data = Data(config)
     found = data.frames.grid
     name = f"the radar of {config.data.roots[0]}"
-    expected = f"{records.describe_grid(saved.grid)}, as the model was trained"
-    require(found == saved.grid, name, records.describe_grid(found), expected)
+    check_bins(config.model, found, name)
+    if found != saved.grid:
+        _log.warning(
+            "%s has %s, while the model was trained with %s: the numbers are those of a "
+            "model on another radar",
+            name,
+            records.describe_grid(found),
+            records.describe_grid(saved.grid),
+        )
     return config, data
 
 
