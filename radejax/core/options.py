@@ -237,5 +237,10 @@ def did_you_mean(name: str, known: Collection[str], prefix: str = "") -> str:
         >>> did_you_mean("radnet", ["radenet", "dinorade"])
         '; did you mean radenet?'
     """
-    near = difflib.get_close_matches(name, known, 1)
+    last = name.rpartition(".")[2]  # which has to be similar, not only the section
+    near = [
+        found
+        for found in difflib.get_close_matches(name, known)
+        if difflib.get_close_matches(last, found.split("."), 1)
+    ]
     return f"; did you mean {prefix}{near[0]}?" if near else ""

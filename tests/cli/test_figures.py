@@ -2,6 +2,8 @@
 
 import pathlib
 import shutil
+from types import SimpleNamespace
+from typing import Any
 
 import click.testing
 import numpy as np
@@ -11,7 +13,10 @@ from PIL import Image
 
 import radejax
 from radejax.cli.figures import overlay, viewer_scenes
+from radejax.config import Config
+from radejax.core.structures import Boxes
 from radejax.data.kradar import KRadar
+from radejax.detection.decode import DecodeOptions
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
 from radejax.visualize import style
@@ -125,6 +130,32 @@ def test_the_region_is_that_of_the_evaluation_and_named(
     _run("1", root, *arguments)
     texts = [text.get_text() for text in drawn[0].legends[0].get_texts()]
     assert texts[1:] == ([expected] if expected else [])
+
+
+def test_detections_of_a_run_are_drawn_beside_the_labels(
+    root: pathlib.Path, drawn: list[Figure], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    grid = KRadar([root]).grid
+    found = Boxes.one_frame([[20.0, 0, 0, 4, 2, 1.5, 0]], ["Sedan"], [0.9])
+
+    class Detector:
+        takes_camera = False
+        decode_options = DecodeOptions(score_threshold=0.25)
+        saved = SimpleNamespace(config=Config())
+
+        def __init__(self) -> None:
+            self.grid = grid
+
+        def __call__(self, *_: object) -> Any:
+            return SimpleNamespace(to_boxes=lambda: found)
+
+    monkeypatch.setattr(radejax.Detector, "from_workdir", lambda _: Detector())
+    _run("1", root, "--workdir", root)
+    texts = [text.get_text() for text in drawn[0].legends[0].get_texts()]
+    assert texts[1] == "prediction (1), score ≥ 0.25"
+    assert "Sedan 0.90" in [text.get_text() for text in drawn[0].axes[0].texts]
+    error = _run("1", root, "--workdir", root, "--slices", code=2).stderr
+    assert "--slices shows no detections" in error
 
 
 def test_frames_with_projections_only_are_shown(tmp_path: pathlib.Path) -> None:

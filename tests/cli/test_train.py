@@ -6,9 +6,11 @@ import pathlib
 import click
 import pytest
 from click.testing import CliRunner, Result
+from matplotlib.figure import Figure
 
 from radejax.cli import entry
 from radejax.cli.train import train
+from radejax.config import Config
 
 
 def _train(*arguments: str) -> Result:
@@ -42,6 +44,29 @@ def test_wrong_use_is_one_line_and_writes_nothing(
     assert message in ended.stderr
     assert "Traceback" not in ended.output
     assert not run.exists()
+
+
+def test_samples_are_drawn_instead_of_training(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[Config] = []
+
+    def draw(config: Config) -> Figure:
+        asked.append(config)
+        return Figure()
+
+    monkeypatch.setattr("radejax.runs.figures.draw_training_samples", draw)
+    words = ["--config=quickstart:short", f"--workdir={tmp_path / 'run'}"]
+    words.append("--config.data.mirror_probability=1.0")
+    ended = _train(*words, f"--draw-samples={tmp_path / 'samples.txt'}")
+    assert ended.exit_code == entry.WRONG_USE
+    assert "cannot write a figure as 'samples.txt'" in ended.stderr
+    assert not asked
+    ended = _train(*words, f"--draw-samples={tmp_path / 'samples.png'}")
+    assert ended.exit_code == 0, ended.output
+    assert asked[0].data.mirror_probability == 1.0
+    assert (tmp_path / "samples.png").is_file()
+    assert not (tmp_path / "run").exists()
 
 
 def test_train_takes_a_part_of_the_data(tmp_path: pathlib.Path) -> None:

@@ -86,6 +86,7 @@ def test_changes_are_of_fields_of_sections_or_of_whole_sections() -> None:
         ({"part.mixed": ("x",)}, "part.mixed[0] is 'x', expected an integer"),
         ({"part.is_on": 1}, "part.is_on is 1, expected a boolean"),
         ({"part.rat": 1}, "part.rat is not a field; did you mean config.part.rate?"),
+        ({"part.optimizer": 1}, "part.optimizer is not a field"),
         ({"seeed": 1}, "seeed is not a field; did you mean config.seed?"),
     ],
 )

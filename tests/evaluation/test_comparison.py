@@ -257,6 +257,32 @@ def test_predictions_in_files_are_compared(stored, scene, write_table):
     assert json.loads(done.stdout) == rows
 
 
+def test_frames_are_compared_by_key(scene, tmp_path):
+    """A run was evaluated on a part of the frames only, which have other ids there."""
+    truth, found, frames = scene
+    chosen = frames["weather"] == frames["weather"][-1]
+    ids = frames["frame"][chosen][::-1]
+    part = {name: np.asarray(column)[chosen][::-1] for name, column in frames.items()}
+    part["frame"] = np.arange(len(ids))
+
+    def renumbered(table):
+        rows = np.isin(table["frame"], ids)
+        new = {old: i for i, old in enumerate(ids)}
+        kept = {name: column[rows] for name, column in table.items()}
+        return {**kept, "frame": np.array([new[x] for x in kept["frame"]])}
+
+    write_report(truth, found, frames, tmp_path / "all", OPTIONS)
+    tables = map(renumbered, (truth, found))
+    write_report(*tables, part, tmp_path / "part", OPTIONS)
+    runs = [tmp_path / "all", tmp_path / "part"]
+    source = Source(weather=(str(part["weather"][0]),))
+    _, rows = compare_files(runs, None, source, OPTIONS)
+    assert rows
+    assert {row["difference"] for row in rows} == {0.0}
+    with pytest.raises(UserError, match=r"different frames \(\d+ and \d+\), such as"):
+        compare_files(runs, None, Source(), OPTIONS)
+
+
 def test_a_warning_names_the_score_from_which_predictions_were_stored(scene, tmp_path):
     truth, found, frames = scene
     kept = {k: v[found["score"] > 0.3] for k, v in found.items()}

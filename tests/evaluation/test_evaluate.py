@@ -49,6 +49,19 @@ ONE, HIT = truth_of(car()), found_of(car())
 # Numbers worked out by hand -------------------------------------------------------------
 
 
+def test_frames_may_be_named_as_in_the_files_of_a_report():
+    names = np.array(["1/00001_00001", "1/00002_00002"])
+    by_id = [truth_of((0, car(), "Sedan"), (1, car(30.0), "Sedan")), HIT]
+    by_key = [{**table, "frame": names[table["frame"]]} for table in by_id]
+    table = {"frame": [0, 1], "name": names}
+    expected = aps(*by_id, protocol="all_point")
+    np.testing.assert_array_equal(aps(*by_key, protocol="all_point"), expected)
+    found = aps(*by_key, protocol="all_point", frames=table)
+    np.testing.assert_array_equal(found, expected)
+    with pytest.raises(DataError, match=r"predictions: row 0: frame '1/3'"):
+        aps(by_key[0], {**HIT, "frame": np.array(["1/3"])}, frames=table)
+
+
 def test_perfect_predictions_in_every_protocol():
     truth = truth_of(*((f, car(10 + f), "Sedan") for f in range(10)))
     found = found_of(*((f, car(10 + f), "Sedan", 0.9 - f / 100) for f in range(10)))

@@ -7,10 +7,12 @@ import pytest
 
 from radejax import models
 from radejax.core import devices
+from radejax.data.pipeline import LoaderOptions, make_loader, make_table
 from radejax.data.records import preprocess
 from radejax.inference.detector import Detector
 from radejax.inference.predict import predict_dataset
 from radejax.inference.saved import SavedModel
+from radejax.losses.detection import detection_loss
 from radejax.runs.data import Data
 from radejax.runs.evaluate import Evaluation
 from radejax.simulation.config import SimulationOptions
@@ -100,13 +102,28 @@ def test_a_prediction_stops_when_asked(setup):
 
 def test_scores_during_training_name_their_protocol(setup):
     scores = Evaluation(setup.config, setup.data).validate(setup.variables)
-    name = "validation/map_3d_iou30/coco101/score>0.45"
+    name = "test/map_3d_iou30/coco101/score>0.45"
     assert any(key.startswith(name) for key in scores.values)
-    assert all("/simulated" in key for key in scores.values)
+    aps = {key: x for key, x in scores.values.items() if "/m" in key or "/ap" in key}
+    assert all("/simulated" in key for key in aps)
     assert any(key.endswith("/Sedan") for key in scores.values)
     means = [v for k, v in scores.values.items() if k.startswith(name)]
     assert means == [scores.best]
-    assert len(scores.figures) == 1
+    assert list(scores.figures) == [f"test/04_{setup.frames[2].name}"]
     mesh = devices.make_mesh(1)
     alone = Evaluation(setup.config, setup.data, mesh=mesh).validate(setup.variables)
-    assert alone.values == pytest.approx(scores.values)
+    assert alone.values == pytest.approx(scores.values, rel=1e-4)
+    # The loss is the mean of the losses of single frames.
+    table = make_table(setup.records, setup.frames, max_objects=30)
+    one_by_one = LoaderOptions(1, shuffle=False, num_epochs=1, num_threads=0)
+    grid = models.map_grid(setup.records.grid, setup.model, "bins")
+    expected = []
+    for batch in make_loader(table, one_by_one):
+        maps = setup.model.apply(setup.variables, *batch.model_inputs(), train=False)
+        terms = detection_loss(maps, batch, grid, setup.config.loss)[1]
+        expected.append(
+            [float(terms[name]) for name in ("focal", "gwd", "weighted_sum")]
+        )
+    found = [alone.values[f"test/{name}"] for name in ("focal", "gwd", "weighted_sum")]
+    np.testing.assert_allclose(found, np.mean(expected, 0), rtol=1e-4)
+    assert alone.values["test/loss"] == pytest.approx(4.0)

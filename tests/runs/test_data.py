@@ -14,6 +14,7 @@ from radejax.config import Config
 from radejax.core.errors import UserError
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.reduce import reduce_dataset
+from radejax.geometry.radar_grid import RadarGrid
 from radejax.runs import data as run_data
 from radejax.runs.data import Data, data_name, data_of_run, located, open_data
 from radejax.simulation.config import SimulationOptions
@@ -216,7 +217,10 @@ def test_frames_that_are_in_no_split_are_counted(
 
 
 def test_a_run_is_evaluated_on_its_part_or_on_all_of_other_folders(
-    root: pathlib.Path, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+    root: pathlib.Path,
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     frames, copy = KRadar(root), str(shutil.copytree(root, tmp_path / "copy"))
     given = str(tmp_path / "copy")  # any folder that exists
@@ -242,6 +246,15 @@ def test_a_run_is_evaluated_on_its_part_or_on_all_of_other_folders(
     ):
         _, found = data_of_run(saved, changes)
         assert {frame.sequence for frame in found.frames} == expected
+    saved.grid = RadarGrid.reduced(num_doppler=16, num_range=8, num_elevation=9)
+    with caplog.at_level("WARNING", "radejax"):
+        data_of_run(saved)
+    assert "while the model was trained with 16 x 8 x 9" in caplog.text
+    saved.config = saved.config.replace(model={"doppler_bins": 8})
+    with pytest.raises(
+        UserError, match=r"doppler_bins is 8, expected 16, as the radar"
+    ):
+        data_of_run(saved)
 
 
 def test_sequences_are_held_out_for_validation(

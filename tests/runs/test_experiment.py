@@ -1,8 +1,11 @@
 """Work folders, names and messages of whole runs."""
 
 import collections
+import hashlib
 import json
 import pathlib
+import re
+import subprocess
 from types import SimpleNamespace
 from typing import Any
 
@@ -121,6 +124,8 @@ def test_a_run_of_two_frames(
         "Best checkpoint, chosen on the validation split: ",
     ):
         assert text in caplog.text
+    rows = [json.loads(x) for x in (folder / "metrics.jsonl").open()]
+    assert all(f"validation/{name}" in rows[-1] for name in config.loss.weights)
     (events,) = (folder / "tensorboard").glob("*.test")
     assert b"test/map_3d_iou30/coco101/" in events.read_bytes()
     frames = json.loads((folder / "evaluation" / "frames.json").read_text())
@@ -222,6 +227,29 @@ def test_what_a_run_started_from_is_kept(tmp_path: pathlib.Path) -> None:
     (tmp_path / "run.json").write_text(json.dumps(info))
     again = experiment.run_info(tmp_path)
     assert again["init_from"] == info["init_from"]
+
+
+def test_commit_and_own_parts_of_a_run_are_stored(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert experiment.run_info(tmp_path)["commit"] is None
+    own = tmp_path / "own_terms.py"
+    own.write_text("def size(pairs, options):\n    return 0.0\n")
+    name = ["-c", "user.name=a", "-c", "user.email=a@b"]
+    for words in (["init", "-q"], ["add", "."], [*name, "commit", "-qm", "Add"]):
+        subprocess.run(["git", *words], check=True)
+    commit = experiment.run_info(tmp_path)["commit"]
+    assert re.fullmatch("[0-9a-f]{40}", commit)
+    own.write_text("def size(pairs, options):\n    return 1.0\n")
+    assert experiment.run_info(tmp_path)["commit"] == f"{commit}-dirty"
+    monkeypatch.syspath_prepend(tmp_path)
+    weights = {"own_terms": ("own_terms:size",), "weights.size": 1.0}
+    config = Config().replace(loss=weights)
+    config.check_imports()
+    digest = hashlib.sha256(own.read_bytes()).hexdigest()
+    assert experiment.own_parts(config) == {"own_terms:size": digest}
+    assert experiment.own_parts(Config()) == {}
 
 
 # Several seeds -----------------------------------------------------------------------

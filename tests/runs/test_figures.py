@@ -1,13 +1,63 @@
-"""Figures of a run: which frames, and in which order."""
+"""Figures of a run: which frames in which order, and what a sample looks like."""
 
+import pathlib
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from radejax.config import load_config
+from radejax.data.kradar import KRadar
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.runs import figures
+from radejax.runs.figures import draw_training_samples, frame_scene
+from radejax.visualize.style import Scene
+
+from .. import small_models as small
+
+
+def test_samples_are_drawn_with_their_augmentation(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[Any] = []
+    monkeypatch.setattr(
+        figures, "draw_samples", lambda rows, grid: drawn.append((rows, grid))
+    )
+    config = small.shrink_run(load_config("quickstart_fusion:short")).replace(
+        simulation={"train_sequences": 1, "test_sequences": 0},
+        data={"roots": (str(tmp_path / "data"),), "mirror_probability": 1.0},
+        train={"batch_size": 3},
+    )
+    config = config.replace(simulation={"frames_per_sequence": 3})
+    draw_training_samples(config, count=2)
+    ((rows, grid),) = drawn
+    assert len(rows) == 2
+    for frame, scene, target in rows:
+        np.testing.assert_allclose(scene.power, frame.power[:, ::-1])
+        np.testing.assert_array_equal(scene.image, frame.image[:, ::-1])
+        mirrored = frame.ground_truth.box * [1, -1, 1, 1, 1, 1, -1]
+        np.testing.assert_allclose(scene.ground_truth.box, mirrored, atol=1e-5)
+        assert list(scene.ground_truth.cls) == list(frame.ground_truth.cls)
+        bins = grid.nearest_bin(*mirrored[:, :2].T)
+        np.testing.assert_array_equal(target[bins[:, 0], bins[:, 1]], 1.0)
+        pixels = [
+            s.camera.project_boxes(b)[0]
+            for s, b in ((frame, frame.ground_truth.box), (scene, mirrored))
+        ]
+        ends = [np.sort(x[..., 0].reshape(len(mirrored), -1)) for x in pixels]
+        width = scene.image.shape[1]
+        np.testing.assert_allclose(ends[1], (width - ends[0])[:, ::-1], atol=1e-2)
+    monkeypatch.undo()
+    figure = figures.draw_samples(rows, grid)
+    titles = [ax.get_title() for ax in figure.axes]
+    assert titles[:2] == [rows[0][0].title, "input of the network"]
+    assert len(titles) == 8
+    (frame,) = KRadar([tmp_path / "data"])[:1]
+    scene: Scene = frame_scene(
+        frame, rows[0][0].projection, rows[0][0].grid, roi="wide"
+    )
+    assert scene.roi == (0.0, 72.0, -16.0, 16.0, -2.0, 7.6)
 
 
 def test_scenes_are_the_fullest_of_each_weather_in_the_order_of_tables() -> None:

@@ -55,6 +55,7 @@ class Tiny:
             steps_per_epoch=steps_per_epoch,
             grid=self.map_grid,
             info=info or {},
+            keys=[f"1/{i:05d}" for i in range(NUM_FRAMES)],
         )
         arguments = {
             "config": self.config,

@@ -75,6 +75,11 @@ def wait(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], float]:
     return go_on
 
 
+def _batches(wait: Callable[[float], float], *seconds: float) -> Any:
+    """Batches that take some seconds to read."""
+    return (SimpleNamespace(frame=wait(x)) for x in seconds)
+
+
 def test_waiting_for_data_is_warned_of_once(
     wait: Callable[[float], float],
     tmp_path: pathlib.Path,
@@ -83,7 +88,7 @@ def test_waiting_for_data_is_warned_of_once(
 ) -> None:
     monkeypatch.setattr(hooks, "usable_cpus", lambda: 7)
     config = Config()
-    throughput = hooks.Throughput(map(wait, [0.0, 0.2, 0.2]), 0)
+    throughput = hooks.Throughput(_batches(wait, 0.0, 0.2, 0.2), 0)
     bar = hooks.ProgressBar(0, 10)
     with MetricWriter(tmp_path, config, 0) as writer:
         log: Any = hooks.Log(config, 10, throughput, writer, bar)
@@ -97,7 +102,7 @@ def test_waiting_for_data_is_warned_of_once(
     first, row, _ = map(
         json.loads, (tmp_path / "metrics.jsonl").read_text().splitlines()
     )
-    assert list(first) == ["step", "focal", "learning_rate", "epoch"]
+    assert list(first) == ["step", "minutes", "focal", "learning_rate", "epoch"]
     assert (row["step"], row["focal"], row["epoch"], bar.n) == (2, 1.0, 0.2, 3)
     assert row["frames_per_s"] == pytest.approx(10 / 0.3)
     assert row["data_wait_share"] == pytest.approx(2 / 3)
@@ -113,7 +118,7 @@ def test_a_batch_that_is_loaded_while_the_devices_work_costs_no_time(
         def is_ready(self) -> bool:
             return False
 
-    throughput: Any = hooks.Throughput(map(wait, [0.0, 0.1]), 0)
+    throughput: Any = hooks.Throughput(_batches(wait, 0.0, 0.1), 0)
     next(throughput)
     throughput(2, None, {"loss": Busy()})
     next(throughput)

@@ -34,6 +34,12 @@ def test_series_of_a_run_are_read_and_drawn(tmp_path):
     np.testing.assert_array_equal(series["gwd"], [[1, 2, 4], [0.5, np.nan, 0.5]])
     figure = curves.draw_training(series, ["focal", "gwd"], "run")
     assert [ax.get_title() for ax in figure.axes] == ["focal", "gwd"]
+    held_out = {"validation/focal": ([2, 4], [0.7, 0.6])}
+    figure = curves.draw_training(series | held_out, ["focal", "gwd"])
+    line = figure.axes[0].lines[-1]
+    assert line.get_label() == "validation"
+    np.testing.assert_array_equal(line.get_xydata(), [[2, 0.7], [4, 0.6]])
+    assert len(figure.axes[1].lines) == 2
     path.write_text(text + "oops\n")
     with pytest.raises(DataError, match=r"metrics\.jsonl, line 4"):
         curves.read_metrics(path)

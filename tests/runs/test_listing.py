@@ -1,0 +1,67 @@
+"""The table of runs: what differs, APs and minutes."""
+
+import json
+import pathlib
+
+from click.testing import CliRunner
+
+from radejax.cli.evaluate import runs
+from radejax.config import Config
+
+
+def _write(folder: pathlib.Path, config: Config, minutes: list[float]) -> pathlib.Path:
+    folder.mkdir(parents=True)
+    (folder / "config.json").write_text(json.dumps(config.without_data_paths()))
+    (folder / "run.json").write_text("{}")
+    rows = [{"step": 10 * i, "minutes": x} for i, x in enumerate(minutes, 1)]
+    (folder / "metrics.jsonl").write_text("".join(f"{json.dumps(x)}\n" for x in rows))
+    return folder
+
+
+def _report(folder: pathlib.Path, ap: float) -> None:
+    names = [f"mean/all/map_{space}_iou30/p/roi=narrow" for space in ("bev", "3d")]
+    rows = [{"name": name, "ap": x} for name, x in zip(names, (99.0, ap), strict=True)]
+    content = {"ap": rows, "options": {"protocols": ["p"]}, "split": "test"}
+    (folder / "evaluation").mkdir()
+    (folder / "evaluation" / "metrics.json").write_text(json.dumps(content))
+
+
+def test_runs_are_listed_with_what_differs(tmp_path: pathlib.Path) -> None:
+    config = Config()
+    _report(_write(tmp_path / "a", config, [0.5, 1.0]), 41.5)
+    changed = config.replace(seed=1, loss={"weights": {"focal": 4.0, "gwd": 1.0}})
+    # It was continued: the second start took 2 minutes.
+    _write(tmp_path / "seeds" / "b", changed, [0.5, 1.5, 0.5, 2.0])
+    done = CliRunner().invoke(runs, [str(tmp_path), "--json"])
+    first, second = json.loads(done.output)
+    names = {"seed", "loss.weights.focal"}
+    assert first == {
+        "run": "a",
+        "step": 20,
+        "minutes": 1.0,
+        "ap": 41.5,
+        "metric": "map_3d_iou30/p/roi=narrow",
+        "split": "test",
+        "fields": {"seed": 0, "loss.weights.focal": 2.0},
+    }
+    assert (second["run"], second["minutes"], second["ap"]) == ("seeds/b", 3.5, None)
+    assert second["fields"] == {"seed": 1, "loss.weights.focal": 4.0}
+    assert set(second["fields"]) == names
+    table = CliRunner().invoke(runs, [str(tmp_path)]).output
+    assert "AP: map_3d_iou30/p/roi=narrow, test split" in table
+    assert "seed=1, loss.weights.focal=4.0" in table
+
+
+def test_a_folder_without_runs_is_wrong_use(tmp_path: pathlib.Path) -> None:
+    done = CliRunner().invoke(runs, [str(tmp_path)])
+    assert done.exit_code == 2
+    assert "no run in" in done.stderr
+
+
+def test_runs_of_different_metrics_have_a_column(tmp_path: pathlib.Path) -> None:
+    _report(_write(tmp_path / "a", Config(), [1.0]), 1.0)
+    bev = Config().replace(train={"best_metric": "map_bev_iou30"})
+    _report(_write(tmp_path / "b", bev, [1.0]), 2.0)
+    table = CliRunner().invoke(runs, [str(tmp_path)]).output
+    assert "99.00  map_bev_iou30/p/roi=narrow" in " ".join(table.split(" "))
+    assert "Metric" in table
