@@ -8,7 +8,6 @@ radial part, and the heading of the box most of the rest.
 """
 
 import pathlib
-import sys
 
 import jax.numpy as jnp
 import numpy as np
