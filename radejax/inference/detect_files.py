@@ -296,7 +296,7 @@ def detect_files(
     for frame in todo:
         (out / names[frame]).unlink(missing_ok=True)
     queue = [iter(todo)] if detector.num_frames == 1 else [iter(x) for x in parts]
-    found = [Boxes.one_frame([], [], [])]
+    found = list[Boxes]()
     seen = list[str]()
     failed = dict[int, str]()
     count = {"frames": 0, "boxes": 0, "clipped": 0, "truncated": 0}
@@ -327,7 +327,11 @@ def detect_files(
     for frame in failed:
         add(out, names[frame], None)
     if file_format == "csv":
-        _write_csv(out / "boxes.csv", Boxes.concatenate(found), keys)
+        _write_csv(
+            out / "boxes.csv",
+            Boxes.concatenate(found or [Boxes.one_frame([], [], [])]),
+            keys,
+        )
     if detector.num_frames > 1:
         count["repeated"] = len(dataclasses.replace(inputs, keys=seen).parts(2))
     if detector.takes_camera:

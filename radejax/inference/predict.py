@@ -98,6 +98,7 @@ def predict_dataset(
         classes=detector.classes,
         images=images,
         num_frames=detector.num_frames,
+        targets=detector.saved.config.data.targets if each_batch else (),
     )
     devices: set[jax.Device] = detector.sharding.device_set
     num_processes = len({device.process_index for device in devices})
