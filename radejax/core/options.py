@@ -7,6 +7,7 @@ import importlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Self, TypeVar
 
+import numpy as np
 import pydantic
 from annotated_types import Ge, Gt, Le, Lt
 from pydantic_core import ErrorDetails
@@ -42,8 +43,8 @@ _WORDS = (
 class Options(pydantic.BaseModel):
     """Immutable options of one part of the program, which are a section of the config.
 
-    Types and ranges are those of the annotations; values are not converted, except lists to
-    tuples, integers to floats, mappings to sections, and path objects to text. A subclass
+    Types and ranges are those of the annotations; values are not converted, except lists and
+    arrays to tuples, integers to floats, mappings to sections, and path objects to text. A subclass
     names its section, for example `class TrainOptions(Options, section="config.train")`,
     which begins every message.
 
@@ -133,7 +134,9 @@ def _merged(
 
 
 def as_tuples(value: object) -> object:
-    """Converts lists to tuples, recursively in lists and mappings."""
+    """Converts lists and arrays to tuples, recursively in lists and mappings."""
+    if isinstance(value, np.ndarray):
+        value = value.tolist()
     if isinstance(value, list | tuple):
         return tuple(map(as_tuples, value))
     if isinstance(value, Mapping):

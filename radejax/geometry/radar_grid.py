@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int, Real
 
-from radejax.core.errors import require
+from radejax.core.errors import UserError, require
 from radejax.core.files import JsonObject
 from radejax.core.structures import Array
 from radejax.geometry.boxes import ArrayT, Number, array_module, as_floats
@@ -126,7 +126,7 @@ class RadarGrid(ArrayValues):
         fov_azimuth_rad: Maximum absolute azimuth of the field of view in radians.
 
     Raises:
-        ValueError: Range or azimuth has fewer than 2 bins, elevation and Doppler are both
+        UserError: Range or azimuth has fewer than 2 bins, elevation and Doppler are both
             empty, an axis is not monotonic or has a value above 10,000, ranges decrease,
             or a limit of the field of view is not in (0, 10,000], or above twice the
             end of its axis, as if they had different units.
@@ -146,22 +146,28 @@ class RadarGrid(ArrayValues):
         for name, least in _LEAST_BINS.items():
             axis = self.freeze(name)
             if axis.ndim != 1 or axis.size < least:
-                raise ValueError(
+                raise UserError(
                     f"{name} must be a vector of at least {least} bins, got shape "
                     f"{axis.shape}"
                 )
-            limit = np.pi if name.endswith("_rad") else _MAX_VALUE
+            is_angle = name.endswith("_rad")
+            limit = np.pi if is_angle else _MAX_VALUE
             if not (np.abs(axis) <= limit).all():
-                raise ValueError(f"{name} must be finite, to {limit:g}, got {axis}")
+                hint = " radians (np.deg2rad converts degrees)" if is_angle else ""
+                raise UserError(
+                    f"{name} must be finite, to {limit:g}{hint}, got values from "
+                    f"{axis.min():g} to {axis.max():g}"
+                )
             kind = "increasing"
             steps = np.diff(axis)
             if name != "range_m":
                 steps *= np.sign(axis[-1:] - axis[:1])
                 kind = "increasing or decreasing"
             if not (steps > 0).all():
-                raise ValueError(f"{name} must be {kind}, got {axis}")
+                first, then = axis[(i := int((steps <= 0).argmax())) : i + 2]
+                raise UserError(f"{name} must be {kind}, got {first:g} before {then:g}")
         if not self.num_elevation + self.num_doppler:
-            raise ValueError(
+            raise UserError(
                 "elevation_rad and doppler_mps are both empty, expected at least one bin"
             )
         for name in ("fov_range_m", "fov_azimuth_rad"):
@@ -170,7 +176,7 @@ class RadarGrid(ArrayValues):
             limit = min(limit, 2 * np.abs(getattr(self, name[len("fov_") :])).max())
             if not 0 < value <= limit:
                 message = f"positive, to {limit:g} for its axis, got {value}"
-                raise ValueError(f"{name} must be {message}")
+                raise UserError(f"{name} must be {message}")
 
     # Construction --------------------------------------------------------------------
 

@@ -1,0 +1,262 @@
+"""From ADC samples to power: signs, sizes, aliasing, files and wrong input."""
+
+import pathlib
+import re
+
+import jax
+import numpy as np
+import pytest
+
+from radejax.core.errors import DataError, UserError
+from radejax.data.adc import LIGHT_MPS, FmcwRadar, adc_to_power, read_ti_bin
+
+WAVELENGTH_M = LIGHT_MPS / 77e9
+HALF = WAVELENGTH_M / 2
+
+
+def row(y, z=0.0):
+    """Positions in half wavelengths."""
+    y, z = np.broadcast_arrays(y, z)
+    return HALF * np.stack([0.0 * y, y, z], -1)
+
+
+# Three transmitters and four receivers: eight virtual antennas in a row and four above them.
+RADAR = FmcwRadar(
+    tx_m=row([0.0, 2.0, 4.0], [0.0, 1.0, 0.0]),
+    rx_m=row(np.arange(4.0)),
+    azimuth_rad=np.arcsin(np.linspace(-0.75, 0.75, 13)),
+    elevation_rad=np.deg2rad([-30.0, 0.0, 30.0]),
+    carrier_hz=77e9,
+    slope_hz_per_s=30e12,
+    sample_rate_hz=10e6,
+    chirp_period_s=20e-6,
+    num_chirps=16,
+    num_samples=64,
+)
+GRID = RADAR.make_grid()
+
+
+def echo(radar, range_m, velocity_mps=0.0, azimuth_rad=0.0, elevation_rad=0.0):
+    """Samples of a moving point by the delays between its position and all antennas.
+
+    In float64 and without the far field's approximation; it is the phase of the transmitted
+    chirp less that of the delayed one, at every sample.
+    """
+    num_chirps, num_tx, _, num_samples = radar.shape
+    flat = np.cos(elevation_rad)
+    toward = np.array([
+        flat * np.cos(azimuth_rad),
+        -flat * np.sin(azimuth_rad),
+        np.sin(elevation_rad),
+    ])  # fmt: skip
+    in_chirp = (np.arange(num_samples) - (num_samples - 1) / 2) / radar.sample_rate_hz
+    chirp = np.arange(num_chirps)[:, None] * num_tx + np.arange(num_tx)
+    time = chirp[:, :, None, None] * radar.chirp_period_s + in_chirp  # [D, T, 1, N]
+    time = time - time.mean()
+    place = (range_m + velocity_mps * time)[..., None] * toward
+    way = np.linalg.norm(place - np.array(radar.tx_m)[:, None, None], axis=-1)
+    way = way + np.linalg.norm(place - np.array(radar.rx_m)[:, None], axis=-1)
+    delay = way / LIGHT_MPS
+    now, slope = in_chirp, radar.slope_hz_per_s
+    sent = radar.carrier_hz * now + slope / 2 * now**2
+    received = radar.carrier_hz * (now - delay) + slope / 2 * (now - delay) ** 2
+    samples = np.exp(2j * np.pi * (sent - received))
+    return samples if radar.is_complex else 2 * samples.real
+
+
+def power_of(radar, samples, **options):
+    return np.asarray(adc_to_power(samples, radar, **options), np.float64)
+
+
+def peak(power):
+    return tuple(int(i) for i in np.unravel_index(power.argmax(), power.shape))
+
+
+@pytest.mark.parametrize("is_complex", [True, False])
+@pytest.mark.parametrize(
+    ("doppler", "range_", "elevation", "azimuth"),
+    [(8, 10, 1, 6), (11, 20, 1, 2), (3, 30, 1, 11), (8, 12, 2, 6), (9, 25, 0, 8)],
+)
+def test_a_point_is_at_its_place_with_the_power_of_the_windows(
+    is_complex, doppler, range_, elevation, azimuth
+):
+    """Right azimuth and receding velocity are positive, and TDM does not shift the angle."""
+    radar = RADAR.replace(is_complex=is_complex)
+    grid = radar.make_grid()
+    where = (
+        grid.range_m[range_],
+        grid.doppler_mps[doppler],
+        grid.azimuth_rad[azimuth],
+        grid.elevation_rad[elevation],
+    )
+    power = power_of(radar, echo(radar, *where))
+    assert power.shape == grid.shape_drea
+    assert peak(power) == (doppler, range_, elevation, azimuth)
+    gains = [window.sum() ** 2 for window in radar.windows()]
+    assert power.max() == pytest.approx(np.prod(gains), rel=0.01)
+
+
+def test_axes_have_the_waveforms_resolution():
+    assert GRID.range_m[:2] == pytest.approx([0, LIGHT_MPS / (2 * 30e12 * 64 / 10e6)])
+    assert GRID.doppler_mps[[0, 8]] == pytest.approx([-WAVELENGTH_M / (4 * 60e-6), 0])
+    assert RADAR.replace(max_range_m=10.0).make_grid().num_range == 13
+    assert RADAR.replace(is_complex=False).make_grid().num_range == 32
+
+
+def test_velocities_alias_and_real_samples_mirror_nothing():
+    """A target of twice the axis's end is 0 m/s; the angle's compensation is then wrong."""
+    around = 2 * -GRID.doppler_mps[0]
+    radar = RADAR.replace(tx_m=RADAR.tx_m[:1])  # of three times the axis
+    still, fast = (
+        power_of(radar, echo(radar, GRID.range_m[20], v)) for v in (0.0, 3 * around)
+    )
+    assert peak(still) == peak(fast)
+    assert peak(power_of(RADAR, echo(RADAR, GRID.range_m[20], around)))[0] == 8
+    assert peak(power_of(RADAR, echo(RADAR, GRID.range_m[20], around)))[3] != 6
+
+
+def test_sidelobes_in_range_and_doppler_are_those_of_a_hann_window():
+    power = power_of(RADAR, echo(RADAR, GRID.range_m[20]))[..., 1, 6]
+    for line in (power[8] / power.max(), power[:, 20] / power.max()):
+        level = 10 * np.log10(line + 1e-12)
+        beside = np.sort(level)[::-1][1:5]
+        assert beside[:2] == pytest.approx([-6, -6], abs=0.1)
+        assert (beside[2:] < -50).all()
+
+
+def test_white_noise_keeps_its_power():
+    rng = np.random.default_rng(0)
+    noise = rng.normal(size=(2, *RADAR.shape))
+    power = power_of(RADAR, (noise[0] + 1j * noise[1]).astype(np.complex64))
+    assert power.mean() == pytest.approx(2.0, rel=0.1)
+    real = RADAR.replace(is_complex=False)
+    assert power_of(real, noise[0]).mean() == pytest.approx(1.0, rel=0.1)
+
+
+def test_a_calibration_undoes_the_errors_of_the_channels():
+    rng = np.random.default_rng(0)
+    errors = np.exp(1j * rng.uniform(-2, 2, (3, 4)))
+    samples = echo(RADAR, GRID.range_m[20], 0.0, 0.3, 0.0)
+    expected = power_of(RADAR, samples)
+    wrong = samples * errors[None, :, :, None]
+    assert power_of(RADAR, wrong).max() < 0.7 * expected.max()
+    found = power_of(RADAR, wrong, calibration=1 / errors)
+    np.testing.assert_allclose(found, expected, atol=1e-5 * expected.max())
+
+
+def test_frames_can_be_batched():
+    samples = np.stack([echo(RADAR, r) for r in GRID.range_m[[20, 30]]])
+    power = jax.vmap(lambda frame: adc_to_power(frame, RADAR))(samples)
+    assert [peak(np.asarray(p))[1] for p in power] == [20, 30]
+
+
+@pytest.mark.parametrize("is_offset_binary", [True, False])
+@pytest.mark.parametrize("is_interleaved", [True, False])
+@pytest.mark.parametrize("is_complex", [True, False])
+def test_files_of_all_layouts_are_read(
+    is_complex: bool,
+    is_interleaved: bool,
+    is_offset_binary: bool,
+    tmp_path: pathlib.Path,
+) -> None:
+    """Written word by word as TI's document lists them."""
+    radar = RADAR.replace(num_chirps=2, num_samples=4, is_complex=is_complex)
+    shape = (3, *radar.shape, 2 if is_complex else 1)
+    counts = np.random.default_rng(0).integers(-(2**15), 2**15, shape)
+    words = []
+    for chirp in counts.reshape(-1, 4, *shape[-2:]):  # [Q, N, parts]
+        if is_interleaved:
+            words += [
+                chirp[q, n, p]
+                for n in range(4)
+                for p in range(shape[-1])
+                for q in range(4)
+            ]
+        elif is_complex:
+            for q, n in ((q, n) for q in range(4) for n in (0, 2)):
+                words += [*chirp[q, n : n + 2, 0], *chirp[q, n : n + 2, 1]]
+        else:
+            words += [chirp[q, n, 0] for q in range(4) for n in range(4)]
+    path = tmp_path / "adc_data.bin"
+    kind = "<u2" if is_offset_binary else "<i2"
+    (np.array(words) + 2**15 * is_offset_binary).astype(kind).tofile(path)
+    layout = {"is_interleaved": is_interleaved, "is_offset_binary": is_offset_binary}
+    for frame, parts in enumerate(counts):
+        expected = parts[..., 0] + (1j * parts[..., 1] if is_complex else 0)
+        found = read_ti_bin(path, frame, radar, **layout)
+        assert found.dtype == (np.complex64 if is_complex else np.float32)
+        np.testing.assert_array_equal(found, expected)
+    with pytest.raises(
+        DataError, match=r"adc_data.bin has 3 frames of .* above 3: check"
+    ):
+        read_ti_bin(path, 3, radar, **layout)
+    with pytest.raises(DataError, match=r"adc_data.bin has 2.66667 frames"):
+        read_ti_bin(
+            path, 0, radar.replace(num_samples=6, rx_m=RADAR.rx_m[:3]), **layout
+        )
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"rx_m": np.array([[0, 0.5 * i, 0] for i in range(4)])},
+            "radar.rx_m is in meters; its spacing is 0.5, expected less than 20 wavelengths",
+        ),
+        ({"rx_m": [(0.0, 0.0)]}, r"radar.rx_m\[0\] is missing"),
+        (
+            {"azimuth_rad": [-0.5, 0.5, 0.0]},
+            "azimuth_rad must be increasing or decreasing, got 0.5 before 0$",
+        ),
+        (
+            {"azimuth_rad": np.arange(-50.0, 51.0)},
+            "azimuth_rad must be finite, to 3.14159 radians .* got values from -50 to 50",
+        ),
+        ({"elevation_rad": [0, 10.0]}, "elevation_rad must be finite, to 3.14159 rad"),
+        ({"azimuth_rad": ()}, "azimuth_rad must be a vector of at least 2 bins"),
+        (
+            {"carrier_hz": 77.0},
+            "radar.carrier_hz is 77.0, expected a number of at least 1000000000",
+        ),
+        (
+            {"slope_hz_per_s": 30.0},
+            "radar.slope_hz_per_s is 30.0, expected Hz per second .30 MHz/us are 30e12",
+        ),
+        (
+            {"chirp_period_s": 20.0},
+            "radar.chirp_period_s is 20.0, expected a number of at most 0.1",
+        ),
+        (
+            {"sample_rate_hz": 10_000.0},
+            "radar.sample_rate_hz is 10000.0, expected at least 3.2e",
+        ),
+        ({"max_range_m": 0.1}, "range_m must be a vector of at least 2"),
+        ({"num_chirps": 1}, "radar.num_chirps is 1, expected an integer of at least 2"),
+    ],
+)
+def test_wrong_radars_are_named(change, message):
+    with pytest.raises(UserError, match=message) as error:
+        RADAR.replace(**change)
+    assert len(str(error.value)) < 300
+
+
+@pytest.mark.parametrize(
+    ("samples", "message"),
+    [
+        (
+            np.zeros((16, 2, 4, 64), complex),
+            "shape of samples is (16, 2, 4, 64), expected (16, 3, 4, 64): num_chirps",
+        ),
+        (
+            np.zeros((64, 16, 3, 4), complex),
+            r"shape of samples is (64, 16, 3, 4), expected",
+        ),
+        (
+            np.zeros((16, 3, 4, 64), np.int16),
+            "type of samples is 'int16', expected complex, as radar.is_complex",
+        ),
+    ],
+)
+def test_samples_of_other_radars_are_named(samples, message):
+    with pytest.raises(UserError, match=re.escape(message)):
+        adc_to_power(samples, RADAR)
