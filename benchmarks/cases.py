@@ -22,6 +22,7 @@ import start
 from case import Case, compiled, difference, first_call, timed, waiting
 
 from radejax.config import load_config
+from radejax.data.adc import LIGHT_MPS, FmcwRadar, adc_to_power
 from radejax.data.kradar.tesseract import project_file
 from radejax.data.kradar.write import write_tesseract
 from radejax.data.pipeline import LoaderOptions, make_loader, make_table
@@ -72,6 +73,32 @@ def tpm(machine):
                 f"{tesseract.nbytes / 1e6:.0f} MB of cells, the file in the page cache"
             )
             yield Case(name=f"TPM from a .mat, {name}", columns=columns, note=note)
+
+
+def adc(machine):
+    """ADC samples of a radar with 3 x 4 antennas to power in 64 azimuths."""
+    half = 0.5 * LIGHT_MPS / 77e9
+    radar = FmcwRadar(
+        tx_m=[(0, 4 * half * i, 0) for i in range(3)],
+        rx_m=[(0, half * i, 0) for i in range(4)],
+        azimuth_rad=np.arcsin(np.linspace(-0.9, 0.9, 64)),
+        carrier_hz=77e9,
+        slope_hz_per_s=30e12,
+        sample_rate_hz=15e6,
+        chirp_period_s=20e-6,
+        num_chirps=128,
+        num_samples=256,
+    )
+    white = np.random.default_rng(0).normal(size=(2, *radar.shape)).astype(np.float32)
+    samples = white[0] + 1j * white[1]
+    program, cost = compiled(lambda x: adc_to_power(x, radar), samples)
+    run = functools.partial(inputs.adc_in_numpy, samples, radar)
+    yield Case(
+        name="ADC samples to power, 128 chirps x 12 antennas x 256",
+        columns={"radejax": waiting(program, samples), "NumPy": lambda: timed(run)},
+        error=difference([program(samples)], [run()]),
+        **cost,
+    )
 
 
 def nms(machine):
@@ -219,6 +246,7 @@ BENCHMARKS = {
     "radenet_training": networks.radenet_training,
     "dinorade": networks.dinorade,
     "tpm": tpm,
+    "adc": adc,
     "simulator": simulate,
     "dinorade_training": functools.partial(networks.dinorade, task="training step"),
     "detector": networks.detector,

@@ -58,6 +58,22 @@ def project_released(tesseract):
     return np.concatenate([level.max(axis=2), level.max(axis=3)], axis=-1)
 
 
+def adc_in_numpy(samples, radar):
+    """The steps of `adc_to_power` in NumPy, in the precision of the samples."""
+    of_range, of_doppler, weights = radar.windows()
+    spectrum = np.fft.fft(samples * of_range)
+    spectrum = np.fft.fft(spectrum * of_doppler[:, None, None, None], axis=0)
+    spectrum = np.fft.fftshift(spectrum, axes=0)
+    num_chirps, num_tx, _, num_samples = samples.shape
+    loops = np.arange(num_chirps) / num_chirps - 0.5
+    cycles = np.multiply.outer(loops, np.arange(num_tx) / num_tx)
+    spectrum *= np.exp(-2j * np.pi * cycles)[..., None, None]
+    signals = spectrum.reshape(num_chirps, -1, num_samples).swapaxes(1, 2)
+    steering = (radar.steering() * weights[:, None]).astype(samples.dtype)
+    power = np.square(np.abs(signals.astype(samples.dtype) @ steering))
+    return power.reshape(*power.shape[:2], -1, len(radar.azimuth_rad))
+
+
 def frames_of(size, **camera):
     """Returns a batch of random projections with eight boxes each in the field of view."""
     rng = np.random.default_rng(0)
