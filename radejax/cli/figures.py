@@ -254,7 +254,7 @@ def demo(out: pathlib.Path, seed: int) -> None:
 
     Example: radejax demo --out demo.png
     """
-    from radejax.core.structures import NARROW_ROI
+    from radejax.core.structures import WIDE_ROI
     from radejax.simulation.config import SimulationOptions
     from radejax.visualize.style import figure_format, save_figure
 
@@ -280,7 +280,7 @@ def demo(out: pathlib.Path, seed: int) -> None:
             frames.grid,
             predictions=found,
             score_threshold=detector.decode_options.score_threshold,
-            roi=NARROW_ROI,
+            roi=WIDE_ROI,
             title=f"simulated frame, seed {seed}, {frame.weather}",
         )
     save_figure(radejax.draw_frame(scene), out)

@@ -7,6 +7,7 @@ The sanity checks at the end report systematic errors of the predictions.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Mapping
@@ -190,6 +191,51 @@ def _or_nan(
     return float(statistic(values)) if values.size else math.nan
 
 
+def mistakes(data: EvaluationSet, iou: float) -> dict[str, Int[np.ndarray, "F C"]]:
+    """Counts the mistakes in 3D above the operating score per frame and class.
+
+    Returns:
+        Counts `[F, C]` by kind: "missed" objects, and false positives. A false positive is a
+        "duplicate" if its IoU with an object of its class is above `iou`, as another
+        prediction matches this object; of the "wrong class" if this holds for an object of
+        another class; a "poor box" if it overlaps an object of its class less; and
+        otherwise it is on the "background".
+
+    Examples:
+        >>> car = {"frame": [0], "box": [[20.0, 0, 0, 4, 2, 1.5, 0]], "cls": ["Sedan"]}
+        >>> found = {**car, "cls": ["Bicycle"], "score": [0.9]}
+        >>> data = EvaluationSet(car, found, classes=["Sedan", "Bicycle"])
+        >>> [kind for kind, count in mistakes(data, 0.5).items() if count.any()]
+        ['missed', 'wrong class']
+    """
+    match = data.matched_objects("plain", "free", "3d", iou)
+    above = data.score > OPERATING_SCORE
+    is_missed = ~np.isin(np.arange(len(data.gt)), match[above])
+    truth, found = (
+        dataclasses.replace(x, cls=np.full(len(x), "any")) for x in (data.gt, data.pred)
+    )
+    table = {"frame": np.arange(data.frame.size)}
+    of_any_class = EvaluationSet(truth, found, classes=["any"], frames=table)
+    own, best = np.zeros((2, len(data.pred)))
+    for largest, of in ((own, data), (best, of_any_class)):
+        np.maximum.at(largest, of.pair_pred, of.overlaps("plain")["3d"])
+    groups = {"missed": data.gt_group[is_missed]}
+    is_left = above & (match < 0)
+    for kind, is_kind in (
+        ("duplicate", own > iou),
+        ("wrong class", best > iou),
+        ("poor box", own > 0),
+        ("background", own >= 0),
+    ):
+        groups[kind] = data.pred_group[is_left & is_kind]
+        is_left = is_left & ~is_kind
+    shape = data.frame.size, len(data.classes)
+    return {
+        kind: np.bincount(group, minlength=shape[0] * shape[1]).reshape(shape)
+        for kind, group in groups.items()
+    }
+
+
 def worst_frames(data: EvaluationSet, frames: Columns, iou: float) -> list[Entry]:
     """Finds the frames with the most errors in 3D above the operating score.
 
@@ -206,12 +252,10 @@ def worst_frames(data: EvaluationSet, frames: Columns, iou: float) -> list[Entry
         >>> worst_frames(data, {}, 0.5)
         []
     """
-    match = data.matched_objects("plain", "free", "3d", iou)
-    above = data.score > OPERATING_SCORE
+    missed, *others = (x.sum(axis=1) for x in mistakes(data, iou).values())
+    false = sum(others, np.zeros_like(missed))
+    found = data.gt_count.sum(axis=1) - missed
     num = data.frame.size
-    found = np.bincount(data.pred.frame[above & (match >= 0)], minlength=num)
-    false = np.bincount(data.pred.frame[above & (match < 0)], minlength=num)
-    missed = data.gt_count.sum(axis=1) - found
     order = np.lexsort((np.arange(num), -missed, -(missed + false)))[:10]
     columns = {
         "index": np.arange(num),

@@ -261,6 +261,22 @@ class EvaluationSet:
             label_version=self.label_version,
         )
 
+    def outcomes(
+        self, iou: float
+    ) -> tuple[Int[np.ndarray, " N"], Int[np.ndarray, " M"]]:
+        """Returns whether the boxes match in `all_point` and 3D, in the order of the input.
+
+        Returns:
+            For all objects and all predictions as given: 1 if it is matched, 0 if not, and
+            -1 if it is not evaluated.
+        """
+        match = self.matched_objects("plain", "free", "3d", iou)
+        truth = np.full(len(self.ground_truth), -1)
+        found = np.full(len(self.predictions), -1)
+        truth[self._gt_row] = np.isin(np.arange(len(self.gt)), match)
+        found[self._pred_row] = match >= 0
+        return truth, found
+
     # Shared work ---------------------------------------------------------------------
 
     @_cached

@@ -24,8 +24,8 @@ import itertools
 import json
 import pathlib
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from tabulate import LATEX_ESCAPE_RULES, tabulate
@@ -37,6 +37,7 @@ from radejax.data.kradar.conditions import WEATHERS
 from radejax.evaluation import analysis, protocols
 from radejax.evaluation.boxes import AnyBoxes, Columns, roi_name, write_boxes
 from radejax.evaluation.evaluation_set import EvaluationSet, Result
+from radejax.evaluation.html import Picture, write_html
 from radejax.evaluation.kitti import write_kitti
 from radejax.evaluation.results import (
     ReportOptions,
@@ -46,6 +47,9 @@ from radejax.evaluation.results import (
     make_set,
     to_row,
 )
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 STALE = ("kitti", "precision_recall_*")
 """Patterns of the names of what only some reports contain."""
@@ -78,6 +82,8 @@ def write_report(
     run: str = "radejax",
     left_out: Mapping[str, int] | None = None,
     warnings: Sequence[str] = (),
+    draw_scenes: Callable[[EvaluationSet, pathlib.Path], Iterable[Picture]]
+    | None = None,
 ) -> Report:
     """Evaluates predictions in the given protocols and `all_point`, and writes the report.
 
@@ -92,6 +98,8 @@ def write_report(
         run: Name of the run in tables.
         left_out: Counts of what was read and skipped when loading, by reason.
         warnings: Warnings of loading, which are printed in the report.
+        draw_scenes: Function from the evaluation set and the folder to the figures of frames
+            for `report.html`; none if None.
 
     Raises:
         UserError: An option is invalid, or a column is missing.
@@ -127,6 +135,7 @@ def write_report(
         "ap": [to_row(result) for result in results],
         "subsets": subsets | analysis.subsets(data, frames, iou),
         "box_errors": analysis.box_errors(data, iou, options.find_metrics()),
+        "mistakes": _mistake_counts(data, iou),
         "worst_frames": analysis.worst_frames(data, frames, iou),
     }
     metrics = plain(metrics)
@@ -156,8 +165,9 @@ def write_report(
             write_kitti(
                 folder / "kitti", *data.evaluated(), frames, score_threshold=least
             )
-        if options.plots:
-            _draw_curves(data, frames, options, folder)
+        curves = _draw_curves(data, frames, options, folder) if options.plots else {}
+        scenes = () if draw_scenes is None else draw_scenes(data, folder)
+        write_html(folder / "report.html", metrics, built, curves, scenes)
     return Report(text, metrics, results, pathlib.Path(out_dir))
 
 
@@ -174,8 +184,14 @@ def _all_tables(metrics: JsonObject, tables: RunTables) -> list[Table]:
         built.append(tables.by_weather(protocol, iou))
     built += [subset_table(subsets, kind) for kind in subsets if kind != "protocol"]
     built.append(error_table(metrics["box_errors"]))
+    title = f"Mistakes in 3D at IoU {options.iou_thresholds[0]:g} and score>"
+    title += f"{analysis.OPERATING_SCORE:g}"
+    counts = metrics["mistakes"]
+    built.append(_table_of("mistakes", title, counts, list(counts[0])))
     names = ["frame", "name", "sequence", "missed", "false", "found"]
-    worst = _table_of("Frames with the most mistakes", metrics["worst_frames"], names)
+    worst = _table_of(
+        "worst-frames", "Frames with the most mistakes", metrics["worst_frames"], names
+    )
     return [*built, worst]
 
 
@@ -209,8 +225,12 @@ def _draw_curves(
     frames: Columns,
     options: ReportOptions,
     folder: pathlib.Path,
-) -> None:
-    """Draws precision over recall for each class with objects, one curve per weather."""
+) -> dict[str, Figure]:
+    """Draws precision over recall for each weather, one curve per class with objects.
+
+    Returns:
+        The figures by the names of their files.
+    """
     # Imported here, as matplotlib takes a second to load and is not always needed.
     from radejax.visualize.curves import Curve, draw_precision_recall
     from radejax.visualize.style import save_figure
@@ -218,21 +238,39 @@ def _draw_curves(
     protocol = protocols.RECOMMENDED
     iou = options.iou_thresholds[0]
     suffix = ", simulated data" if data.is_simulated else ""
+    figures = {}
     masks: dict[str, Any] = {"all": None, **condition_masks(frames, "weather")}
     settings: dict[str, Any] = {"iou_thresholds": iou, **options.settings_of(protocol)}
     for space in SPACES:
         panels: dict[str, dict[str, Curve]] = {}
         for name, mask in masks.items():
-            results = data.results(protocol, spaces=space, weights=mask, **settings)
-            for result in results:
-                title = f"{result.cls}, {protocol}, {space}, IoU {iou:g}{suffix}"
+            lines = panels.setdefault(TITLES.get(name, name), {})
+            for result in data.results(
+                protocol, spaces=space, weights=mask, **settings
+            ):
                 curve = (result.recall, result.precision) if result.is_defined else None
-                label = f"{name}, AP {result.ap:.1f}"
-                panels.setdefault(title, {})[label] = curve
-        seen = {title: lines for title, lines in panels.items() if any(lines.values())}
-        figure = draw_precision_recall(seen or dict([*panels.items()][:1]))
-        name = f"precision_recall_{space}_iou{100 * iou:.4g}.{options.figures}"
-        save_figure(figure, folder / name)
+                lines[curve_label(result.cls, result.ap, result.num_gt)] = curve
+        title = f"{protocol}, {space.upper()}, IoU {iou:g}{suffix}"
+        name = f"precision_recall_{space}_iou{100 * iou:.4g}"
+        figures[name] = draw_precision_recall(panels, title)
+        save_figure(figures[name], folder / f"{name}.{options.figures}")
+    return figures
+
+
+def curve_label(name: str, ap: float, num_gt: int) -> str:
+    """Returns the label of a precision-recall curve with its AP and number of objects."""
+    return f"{name}: AP {ap:.1f}, {num_gt:,} objects"
+
+
+def _mistake_counts(data: EvaluationSet, iou: float) -> list[analysis.Entry]:
+    """Counts the objects, found objects and mistakes of each class for metrics.json."""
+    counts = {kind: x.sum(axis=0) for kind, x in analysis.mistakes(data, iou).items()}
+    objects = data.gt_count.sum(axis=0)
+    columns = {"num_gt": objects, "found": objects - counts["missed"], **counts}
+    return [
+        {"cls": cls, **{name: int(column[i]) for name, column in columns.items()}}
+        for i, cls in enumerate(data.classes)
+    ]
 
 
 def plain(values: JsonObject) -> JsonObject:
@@ -257,28 +295,43 @@ class Table:
     """A table of a report.
 
     Attributes:
+        name: Short name, see `label`.
         title: Title that describes the numbers in one line.
         header: `[K]` column titles.
         rows: Rows of `K` strings or counts.
+        best: Row and column of the values that are bold.
     """
 
+    name: str
     title: str
     header: Sequence[str]
     rows: Sequence[Sequence[str | int]]
+    best: Collection[tuple[int, int]] = ()
 
     @property
     def label(self) -> str:
         """Label in LaTeX and name of the file of the table."""
-        return re.sub("[^a-z0-9]+", "-", self.title.lower()).strip("-")
+        return re.sub("[^a-z0-9]+", "-", self.name.lower()).strip("-")
 
     def render(self, style: str = "text", *, is_simulated: bool = False) -> str:
         """Renders the table as "text", "markdown" or "latex" (with caption and label)."""
         align = ["left", *["right"] * (len(self.header) - 1)]
+        # The LaTeX command is inserted below, as tabulate escapes it.
+        marks = {"markdown": "**", "latex": "\x01"}
+        mark = marks.get(style, "")
+        rows = [
+            [
+                f"{mark}{x}{mark}" if (i, j) in self.best else x
+                for j, x in enumerate(row)
+            ]
+            for i, row in enumerate(self.rows)
+        ]
         body = tabulate(
-            self.rows, self.header, STYLES[style], disable_numparse=True, colalign=align
+            rows, self.header, STYLES[style], disable_numparse=True, colalign=align
         )
         title = f"Simulated data: {self.title}" if is_simulated else self.title
         if style == "latex":
+            body = re.sub("\x01(.*?)\x01", r"\\textbf{\1}", body)
             caption = "".join(LATEX_ESCAPE_RULES.get(x, x) for x in title)
             head = f"\\caption{{{caption}}}\n\\label{{tab:{self.label}}}\n"
             return f"\\begin{{table}}\n{head}{body}\n\\end{{table}}\n"
@@ -306,6 +359,15 @@ def number(value: float | None, *, signed: bool = False, digits: int = 2) -> str
     return f"{value:+.{digits}f}" if signed else f"{value:.{digits}f}"
 
 
+def best_rows(
+    body: Sequence[Sequence[str]], rows: Iterable[int], column: int
+) -> set[tuple[int, int]]:
+    """Returns the places of the largest of several numbers in a column of a table."""
+    values = {i: float(body[i][column]) for i in rows if body[i][column] != "-"}
+    largest = max(values.values(), default=0.0)
+    return {(i, column) for i, x in values.items() if x == largest and len(values) > 1}
+
+
 def numbers(values: Iterable[float | None], *, signed: bool = False) -> list[str]:
     """Formats values as table entries (see `number`)."""
     return [number(value, signed=signed) for value in values]
@@ -328,7 +390,7 @@ def subset_table(subsets: JsonObject, kind: str) -> Table:
     title = f"By {kind}, {subsets['protocol']}"
     entries = [entry for entry in subsets[kind] if entry["num_gt"] or entry["num_det"]]
     names = [kind, "cls", "ap", "precision", "recall", "num_gt"]
-    return _table_of(title, entries, names)
+    return _table_of(f"by-{kind}", title, entries, names)
 
 
 def error_table(errors: Mapping[str, Mapping[str, float]]) -> Table:
@@ -338,11 +400,13 @@ def error_table(errors: Mapping[str, Mapping[str, float]]) -> Table:
     medians = [name for name in entries[0] if name.endswith("_median")]
     title = "Median errors of matched boxes (all scores); reversed: heading off by more"
     title += " than 90 deg"
-    return _table_of(title, entries, ["cls", "count", *medians, "reversed"])
+    return _table_of(
+        "box-errors", title, entries, ["cls", "count", *medians, "reversed"]
+    )
 
 
 def _table_of(
-    title: str, entries: Sequence[analysis.Entry], names: Sequence[str]
+    label: str, title: str, entries: Sequence[analysis.Entry], names: Sequence[str]
 ) -> Table:
     """Builds a table with some values of entries of metrics.json, one entry per row."""
     values = [[entry.get(name, "") for name in names] for entry in entries]
@@ -352,7 +416,9 @@ def _table_of(
     ]
     titles = {"cls": "Class", "ap": "AP", "num gt": "Objects", "count": "Matches"}
     words = [name.removesuffix("_median").replace("_", " ") for name in names]
-    return Table(title, [titles.get(word, word.capitalize()) for word in words], rows)
+    return Table(
+        label, title, [titles.get(word, word.capitalize()) for word in words], rows
+    )
 
 
 # Published rows -----------------------------------------------------------------------
@@ -478,7 +544,8 @@ class RunTables:
     def _terms(self, protocol: str) -> str:
         """Returns a protocol with its score threshold, empty-frame rule, labels and region."""
         found = next(r for r in self.results.values() if r.protocol == protocol)
-        return ", ".join(found.metric.split("/")[1:])
+        terms = found.metric.removesuffix("/simulated")  # which titles begin with
+        return ", ".join(terms.split("/")[1:])
 
     def by_weather(self, protocol: str, iou: float) -> Table:
         """Builds the table of classes by weather in one protocol, with "3D / BEV" entries."""
@@ -489,7 +556,10 @@ class RunTables:
             entries = [numbers(self._aps(protocol, pair)) for pair in pairs]
             body.append([cls, *map(" / ".join, entries)])
         title = f"AP 3D / BEV at IoU {iou:g}, {self._terms(protocol)}"
-        return Table(title, ["Class", *(TITLES.get(x, x) for x in conditions)], body)
+        name = f"weather-{protocol}-iou{100 * iou:.4g}"
+        return Table(
+            name, title, ["Class", *(TITLES.get(x, x) for x in conditions)], body
+        )
 
     def by_protocol(self, space: str, iou: float) -> Table:
         """Builds the table of protocols by classes over all weathers.
@@ -506,7 +576,8 @@ class RunTables:
         if any(result.has_interval for result in self.results.values()):
             count = self.options.bootstrap
             title += f", 95 % intervals of {count} resamples of sequences"
-        return Table(title, ["Protocol", *classes], body)
+        name = f"protocols-{space}-iou{100 * iou:.4g}"
+        return Table(name, title, ["Protocol", *classes], body)
 
     def papers(self) -> list[Table]:
         """Builds the tables in the papers' layouts that the classes and IoUs allow.
@@ -524,30 +595,35 @@ class RunTables:
         elsewhere = [row.source for row in PUBLISHED if ", Table" not in row.source]
         tables = [
             self._layout(
+                "sedan-by-weather",
                 "Sedan by weather at IoU 0.3 (layout of Table I)",
                 ["RADE-Net, Table I", "DinoRADE, Table 1"],
                 spaces,
                 conditions,
             ),
             self._layout(
+                "classes-by-weather",
                 "Classes by weather at IoU 0.3 (layout of Table II)",
                 ["RADE-Net, Table II", "DinoRADE, Table 2"],
                 classes,
                 _crossed(conditions, spaces),
             ),
             self._layout(
+                "classes",
                 "Classes, all weathers, IoU 0.3 (layout of DinoRADE's Table 3)",
                 ["DinoRADE, Table 3"],
                 [{"condition": "all"}],
                 _crossed(classes, spaces),
             ),
             self._layout(
+                "ablations",
                 "Ablations, Sedan (layout of Table III)",
                 ABLATIONS,
                 [{"cls": "Sedan"}],
                 ious,
             ),
             self._layout(
+                "other-methods",
                 "Other methods, all weathers, as printed elsewhere",
                 elsewhere,
                 common,
@@ -559,6 +635,7 @@ class RunTables:
 
     def _layout(
         self,
+        name: str,
         title: str,
         sources: Sequence[str],
         groups: Sequence[Place],
@@ -566,14 +643,19 @@ class RunTables:
     ) -> Table:
         """Builds a table of published rows, each with our difference to it, and our rows.
 
+        The best value of each column and group is bold.
+
         Args:
+            name: Short name of the table.
             title: Title of the table.
             sources: Papers and tables whose rows are printed.
             groups: Condition, class, space or IoU threshold of each group of rows.
             columns: Condition, class, space or IoU threshold of each column.
         """
         body: list[list[str]] = []
+        best = set[tuple[int, int]]()
         for group in groups:
+            start = len(body)
             of = _name(group)
             cells = [Cell(**group, **column) for column in columns]
             printed = []
@@ -584,8 +666,8 @@ class RunTables:
                 if row.source not in sources or set(values) == {"-"} or is_repeated:
                     continue
                 printed.append([row.method, *values])
-                name = f"{row.method} ({row.sensors})"
-                body.append([name, of, row.source, row.terms, *values])
+                method = f"{row.method} ({row.sensors})"
+                body.append([method, of, row.source, row.terms, *values])
                 gaps = self._differences(row, cells)
                 if set(gaps) != {"-"}:
                     same = "same protocol, score, labels, region, split"
@@ -593,8 +675,11 @@ class RunTables:
             for protocol in self.options.main_protocols:
                 aps = numbers(self._aps(protocol, cells))
                 body.append([self.run, of, "", self._terms(protocol), *aps])
+            rows = [i for i in range(start, len(body)) if body[i][0] != "difference"]
+            for column in range(4, 4 + len(cells)):
+                best |= best_rows(body, rows, column)
         header = ["Method", "Of", "Source", "Terms", *map(_name, columns)]
-        return Table(title, header, body)
+        return Table(name, title, header, body, best)
 
     def _differences(self, row: PublishedRow, cells: Sequence[Cell]) -> list[str]:
         """Formats our APs minus the printed ones, with "-" if they are not comparable.

@@ -28,9 +28,10 @@ from radejax.core.structures import Batch, Boxes, DetectionMaps
 from radejax.data.cameras import require_images
 from radejax.data.dataset import FrameSequence, LabelledFrame, find_reader
 from radejax.data.projection import decode
-from radejax.evaluation.analysis import box_errors
+from radejax.evaluation.analysis import box_errors, mistakes, worst_frames
 from radejax.evaluation.boxes import roi_bounds, roi_name, tables_from_frames
-from radejax.evaluation.evaluation_set import Result
+from radejax.evaluation.evaluation_set import EvaluationSet, Result
+from radejax.evaluation.html import Picture
 from radejax.evaluation.report import STALE, Report, write_report
 from radejax.evaluation.results import (
     ReportOptions,
@@ -222,6 +223,7 @@ class Evaluation:
         def write() -> Report:
             with files.swapped_in(place, *_STALE, *STALE) as folder:
                 files.write_json(folder / "source.json", {"step": step, **self._source})
+                draw_scenes = functools.partial(self._draw_scenes, predictions)
                 report = write_report(
                     self._truth,
                     predictions,
@@ -230,12 +232,12 @@ class Evaluation:
                     self._options,
                     run=run or workdir.name,
                     left_out=self._frames.summary().counts,
+                    draw_scenes=draw_scenes,
                 )
                 _log.info("step %s, split %s\n%s", step, self._split, report.text)
                 if self._detector.takes_camera:
                     self._write_camera_share(variables, folder / "camera_share.json")
-                worst = [entry["frame"] for entry in report.metrics["worst_frames"]]
-                self._write_figures(predictions, workdir, folder, worst)
+                self._write_figures(predictions, workdir, folder)
             return dataclasses.replace(report, folder=place)
 
         return devices.main_only(write)
@@ -248,23 +250,53 @@ class Evaluation:
         grid = self._data.records.grid
         files.write_json(path, figures.average_shares(shares, grid))
 
+    def _draw_scenes(
+        self, predictions: Boxes, data: EvaluationSet, folder: pathlib.Path
+    ) -> Iterator[Picture]:
+        """Draw frames, write figures of the usual and the worst ones, and yield all.
+
+        With visualizations, there are also frames of every class, weather and kind of
+        mistake.
+        """
+        frames = self._frames
+        iou = self._options.iou_thresholds[0]
+        counts = mistakes(data, iou)
+        worst = [int(entry["index"]) for entry in worst_frames(data, {}, iou)]
+        usual = self._spread(self._options.num_visualizations)
+        indices = [*worst, *usual]
+        if usual:
+            indices += figures.fullest_of_weathers(frames).values()
+            indices += data.gt_count.argmax(axis=0).tolist()
+            indices += [int(count.sum(axis=1).argmax()) for count in counts.values()]
+        (folder / "worst_frames").mkdir()  # replaces that of an earlier evaluation
+        shown = list(dict.fromkeys(indices))
+        drawn = self._figures(predictions, shown)
+        for index, (name, figure) in zip(shown, drawn, strict=True):
+            for kind, among in (("figures", usual), ("worst_frames", worst)):
+                if index in among:
+                    save_figure(
+                        figure, folder / kind / f"{name}.{self._options.figures}"
+                    )
+            made = {kind: int(x[index].sum()) for kind, x in counts.items()}
+            made = {kind: count for kind, count in made.items() if count}
+            is_there = data.gt_count[index] > 0
+            tags = {
+                "frames": ["worst frames"] if index in worst else [],
+                "class": [data.classes[i] for i in np.flatnonzero(is_there)],
+                "weather": [frames[index].weather],
+                "mistake": list(made),
+            }
+            text = ", ".join(f"{kind}: {count}" for kind, count in made.items())
+            yield Picture(f"{name} ({text or 'no mistakes'})", tags, figure)
+
     def _write_figures(
-        self,
-        predictions: Boxes,
-        workdir: pathlib.Path,
-        folder: pathlib.Path,
-        worst: Sequence[int],
+        self, predictions: Boxes, workdir: pathlib.Path, folder: pathlib.Path
     ) -> None:
-        """Write figures of frames, a figure of all weathers, and the loss curves."""
+        """Write a figure of all weathers and the loss curves."""
         frames = self._frames
         suffix = ", simulated" if frames.is_simulated else ""
         ending = self._options.figures
-        usual = self._spread(self._options.num_visualizations)
-        (folder / "worst_frames").mkdir()  # replaces that of an earlier evaluation
-        for kind, indices in (("figures", usual), ("worst_frames", worst)):
-            for name, figure in self._figures(predictions, indices):
-                save_figure(figure, folder / kind / f"{name}.{ending}")
-        if usual:  # the layout of RADE-Net's Figure 4
+        if self._options.num_visualizations:  # the layout of RADE-Net's Figure 4
             scenes = [
                 self._scene(predictions, i, title=f"{name} ({frames[i].key}){suffix}")
                 for name, i in figures.fullest_of_weathers(frames).items()
@@ -293,6 +325,7 @@ class Evaluation:
             records.grid,
             predictions=predictions.take(is_drawn),
             roi=roi_bounds(self._options.roi),
+            iou=self._options.iou_thresholds[0],
             score_threshold=threshold,
             **fields,
         )

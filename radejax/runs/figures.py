@@ -16,13 +16,14 @@ from numpy.typing import ArrayLike
 from radejax import models
 from radejax.config import Config
 from radejax.core.files import JsonObject
-from radejax.core.structures import Array, Batch, Boxes
+from radejax.core.structures import CLASSES, Array, Batch, Boxes
 from radejax.data.cameras import front_view
 from radejax.data.dataset import FrameSequence, LabelledFrame
 from radejax.data.pipeline import read_sample, sample_keys
 from radejax.data.projection import decode
 from radejax.evaluation.boxes import roi_bounds
-from radejax.evaluation.results import condition_masks
+from radejax.evaluation.evaluation_set import EvaluationSet
+from radejax.evaluation.results import condition_masks, repair_sizes
 from radejax.geometry.boxes import boxes7_from_8
 from radejax.geometry.camera import Camera, CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
@@ -30,20 +31,29 @@ from radejax.losses.focal import gaussian_heatmap
 from radejax.models.radenet import RadeNet
 from radejax.runs.data import Data, located, open_data
 from radejax.visualize.draw import draw_samples
-from radejax.visualize.style import Scene
+from radejax.visualize.style import Matches, Scene
 
 T = TypeVar("T")
 
 
 def frame_scene(
-    frame: LabelledFrame, projection: ArrayLike, grid: RadarGrid, **fields: Any
+    frame: LabelledFrame,
+    projection: ArrayLike,
+    grid: RadarGrid,
+    *,
+    iou: float = 0.3,
+    **fields: Any,
 ) -> Scene:
     """Create the scene of a labelled frame with its boxes, image, calibration and title.
+
+    Predictions are matched to the objects inside the region by the protocol `all_point`, so
+    that figures show which are correct.
 
     Args:
         frame: Frame to draw.
         projection: Projection `[R, A, D+E]` of the frame.
         grid: Grid of the projection.
+        iou: 3D IoU above which a prediction matches an object.
         **fields: Other fields of `Scene`, such as `predictions` and `roi`, which may also
             be "narrow" or "wide".
     """
@@ -53,6 +63,12 @@ def frame_scene(
     given = {"image": image, "camera": camera, "title": title, **fields}
     given["roi"] = roi_bounds(given.get("roi"))
     truth = Boxes.one_frame(frame.boxes, frame.classes)
+    if (found := given.get("predictions")) is not None:
+        found = Boxes.one_frame(found.box, found.cls, found.score)
+        found, _ = repair_sizes(found, "false_positive")
+        classes = sorted({*CLASSES, *truth.cls.tolist(), *found.cls.tolist()})
+        data = EvaluationSet(truth, found, classes=classes, roi=given.get("roi"))
+        given["matches"] = Matches(*data.outcomes(iou), iou)
     return Scene(projection, grid, ground_truth=truth, **given)
 
 

@@ -34,6 +34,7 @@ def draw_camera(
     show_labels: bool = True,
     title: str = "",
     lidar_m: Float[np.ndarray, "N 3"] | None = None,
+    matches: style.Matches | None = None,
 ) -> Axes:
     """Draw the edges and the tinted front faces of 3D boxes on an image.
 
@@ -46,6 +47,7 @@ def draw_camera(
         show_labels: Whether to write class and score at the boxes.
         title: Title of the axes.
         lidar_m: LiDAR points in the radar frame in meters, or None.
+        matches: Matches of ground truth and predictions, or None.
 
     Returns:
         The axes, in pixels of the image.
@@ -77,7 +79,7 @@ def draw_camera(
         pixels, depth_m = calibration.project_ego(lidar_m)
         style.draw_points(ax, pixels[calibration.in_image(pixels, depth_m)] - 0.5)
     labels = []
-    for look, boxes in style.styled_sets(ground_truth, predictions):
+    for look, boxes in style.styled_sets(ground_truth, predictions, matches):
         labels += _draw_boxes(ax, calibration, boxes, look)
     if show_labels:  # near boxes first
         labels.sort(key=lambda label: -np.ptp(label.outline[:, 1]))
@@ -111,6 +113,6 @@ def _draw_boxes(
     labels = []
     for i, hull in zip(drawn, hulls, strict=True):
         height_px = np.ptp(ax.transData.transform(hull)[:, 1])
-        if height_px * 72 / ax.figure.dpi >= _MIN_LABEL_HEIGHT_PT:
-            labels.append(style.Label(hull, texts[i], look.text_color, side))
+        if look.side and height_px * 72 / ax.figure.dpi >= _MIN_LABEL_HEIGHT_PT:
+            labels.append(style.Label(hull, texts[i], look.color, side))
     return labels

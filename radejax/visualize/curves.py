@@ -23,25 +23,31 @@ Curve = tuple[ArrayLike, ArrayLike] | None
 """Recall `[K]` and precision `[K]`, both in [0, 1], of one line; None draws nothing."""
 
 
-def draw_precision_recall(panels: Mapping[str, Mapping[str, Curve]]) -> Figure:
-    """Draw precision over recall, one line per class, condition or model.
+def draw_precision_recall(
+    panels: Mapping[str, Mapping[str, Curve]], title: str = ""
+) -> Figure:
+    """Draw interpolated precision over recall, one line per class, condition or model.
 
-    Lines differ in color and in dash pattern, which depend on the position of the curve
-    in its panel. Use None for missing curves, so that a name has the same color and
-    pattern in all panels.
+    The interpolated precision at a recall is the highest precision at this or a higher
+    recall. In the protocol `all_point`, AP is the area under the drawn steps. Lines differ
+    in color and in dash pattern, which depend on the position of the curve in its panel.
+    Use None for missing curves, so that a name has the same color and pattern in all
+    panels.
 
     Args:
         panels: Curves by name for the title of each panel; at least one panel.
+        title: Title of the figure.
     """
-    columns = min(len(panels), 3)
+    columns = min(len(panels), 4)
     rows = -(-len(panels) // columns)
-    figure = new_figure(4.6 * columns, 4.8 * rows, layout="constrained")
+    figure = new_figure(3.8 * columns, 4.4 * rows, layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False).reshape(-1)
     for ax in axes[len(panels) :]:
         ax.set_axis_off()
-    for ax, (title, curves) in zip(axes, panels.items(), strict=False):
+    for ax, (name, curves) in zip(axes, panels.items(), strict=False):
         _draw_panel(ax, curves)
-        ax.set_title(title, fontsize=9)
+        ax.set_title(name, fontsize=10)
+    figure.suptitle(title)
     return figure
 
 
@@ -51,10 +57,14 @@ def _draw_panel(ax: Axes, curves: Mapping[str, Curve]) -> None:
         if curve is not None:
             recall, precision = (np.asarray(values, float) for values in curve)
             order = np.argsort(recall, kind="stable")
-            ax.plot(recall[order], precision[order], label=label, **_line(i))
+            highest = np.maximum.accumulate(precision[order][::-1])[::-1]
+            # The precision of the first recall holds from 0 on, and 0 after the last one.
+            x = np.concatenate([[0.0], recall[order], recall[order][-1:]])
+            y = np.concatenate([highest[:1], highest, [0.0]])
+            ax.plot(x, y, label=label, drawstyle="steps-pre", **_line(i))
             is_empty = is_empty and not recall.any()
     limits = (0, 1.02)
-    ax.set(xlim=limits, ylim=limits, xlabel="recall", ylabel="precision")
+    ax.set(xlim=limits, ylim=limits, xlabel="recall", ylabel="interpolated precision")
     ax.grid(alpha=0.3)
     if is_empty:
         ax.text(0.5, 0.5, "none found", transform=ax.transAxes, ha="center")
@@ -64,7 +74,6 @@ def _draw_panel(ax: Axes, curves: Mapping[str, Curve]) -> None:
         fontsize=7,
         loc="upper center",
         bbox_to_anchor=(0.5, -0.16),
-        ncols=1 if len(curves) < 4 else 2,
         frameon=False,
     )
 

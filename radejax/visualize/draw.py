@@ -1,8 +1,9 @@
 """Figures of radar frames: bird's-eye view, polar view, one frame, scenes and slices.
 
 The layout follows Figure 4 of RADE-Net and Figure 3 of DinoRADE: the radar map with a
-dashed region of interest, white ground truth with its class, red predictions with class
-and score, and the camera image. In the bird's-eye view, x points up and y to the left, in
+dashed region of interest, ground truth with its class, predictions with class and score,
+and the camera image. Colors distinguish objects that are found and missed, and true and
+false positives, if the scene has matches. In the bird's-eye view, x points up and y to the left, in
 meters, and every range-azimuth bin covers the ground that it measures.
 
 A projection `[R, A, D+E]` consists of two 3D maps: range-azimuth-Doppler (maximum over
@@ -203,9 +204,9 @@ def draw_frame(scene: Scene) -> Figure:
     polar_ax = figure.add_axes((0.57, 0.085, 0.41, height))
     _draw_polar(polar_ax, scene, show_labels=not has_image)
     if has_image:
-        _draw_view(figure.add_axes((0.53, 0.40, 0.45, 0.52)), scene)
+        _draw_view(figure.add_axes((0.53, 0.43, 0.45, 0.49)), scene)
     place = (0.765, 0.095 + height)
-    _add_legend(figure, scene, loc="lower center", bbox_to_anchor=place, ncols=3)
+    _add_legend(figure, scene, loc="lower center", bbox_to_anchor=place, ncols=4)
     figure.suptitle(scene.title)
     return figure
 
@@ -256,7 +257,7 @@ def draw_scenes(scenes: Sequence[Scene]) -> Figure:
         show_counts=False,
         loc="lower left",
         bbox_to_anchor=(0.3 / width, (foot_in - _FOOT_IN + 0.2) / height),
-        ncols=3 if columns > 1 else 1,
+        ncols=4 if columns > 1 else 2,
     )
     return figure
 
@@ -312,6 +313,7 @@ def _draw_view(ax: Axes, scene: Scene, *, show_labels: bool = True) -> None:
         ax=ax,
         show_labels=show_labels,
         lidar_m=scene.lidar_m,
+        matches=scene.matches,
     )
 
 
@@ -370,10 +372,13 @@ def _draw_over(
         edges = to_axes(style.footprints(boxes.box, _POINTS_PER_EDGE))
         marks = to_axes(_heading_marks(boxes.box))
         widths = look.width * np.tile(style.line_scales(ax, edges, 8.0), 2)
-        style.draw_lines(ax, [*edges, *marks], look.color, widths, 4 + order)
+        zorder = 4 + 0.2 * order  # below the texts
+        style.draw_lines(ax, [*edges, *marks], look.color, widths, zorder)
+        if not look.side:
+            continue
         outlines = np.concatenate([edges, marks], 1)
         labels += [
-            style.Label(outline, text, look.text_color, look.side)
+            style.Label(outline, text, look.color, look.side)
             for outline, text in zip(outlines, style.label_texts(boxes), strict=True)
         ]
     if show_labels:
@@ -394,11 +399,12 @@ def _add_legend(
     owner: Axes | Figure, scene: Scene, *, show_counts: bool = True, **place: Any
 ) -> None:
     """Add a legend with one handle per kind of line to axes or a figure."""
-    handles = []
+    counts: dict[style.Style, int] = {}
     for look, boxes in scene.sets:
-        label = f"{look.name} ({len(boxes)})" if show_counts else look.name
-        if boxes.score is not None and scene.score_threshold is not None:
-            label += f", score ≥ {scene.score_threshold:g}"
+        counts[look] = counts.get(look, 0) + len(boxes)
+    handles = []
+    for look, count in counts.items():
+        label = f"{look.name} ({count})" if show_counts else look.name
         line = Line2D([], [], color=look.color, lw=look.width, label=label)
         line.set_path_effects(style.halo(look.width + 1.4))
         handles.append(line)
@@ -410,8 +416,16 @@ def _add_legend(
         label = f"{named[0]} region" if named else "region of interest"
         line = Line2D([], [], color=style.ROI_COLOR, lw=1.4, ls="--", label=label)
         handles.append(line)
-    # Counts, threshold and region fit in this font size.
-    owner.legend(handles=handles, fontsize=8, frameon=False, **place)
+    terms = []
+    if scene.score_threshold is not None and scene.predictions is not None:
+        terms.append(f"score ≥ {scene.score_threshold:g}")
+    if scene.matches is not None:
+        terms.append(f"3D IoU > {scene.matches.iou:g}")
+    if terms:
+        handles.append(Line2D([], [], ls="", label=", ".join(terms)))
+    # Counts, threshold and region fit in these sizes.
+    place |= {"fontsize": 8, "handlelength": 1.6, "columnspacing": 1.2}
+    owner.legend(handles=handles, frameon=False, **place)
 
 
 # Slices -------------------------------------------------------------------------------

@@ -15,13 +15,14 @@ from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from matplotlib.axes import Axes
 from matplotlib.backend_bases import FigureCanvasBase
 from matplotlib.collections import LineCollection, QuadMesh
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patheffects import AbstractPathEffect, Normal, Stroke
+from matplotlib.textpath import TextPath
 from numpy.typing import ArrayLike
 
 from radejax.core.errors import UserError
@@ -47,21 +48,42 @@ class Style(NamedTuple):
 
     Attributes:
         name: Name in legends.
-        color: Color of lines.
-        text_color: Color of labels, which is lighter because text is thinner than lines.
+        color: Color of lines and labels.
         width: Width of lines in points.
-        side: Side of a box on a map at which its label is written.
+        side: Side of a box on a map at which its label is preferably written; empty if it
+            has no label.
     """
 
     name: str
     color: str
-    text_color: str
     width: float
     side: str
 
 
-GROUND_TRUTH = Style("ground truth", "white", "white", 1.9, "left")
-PREDICTION = Style("prediction", "#ff4d40", "#ff7d70", 1.3, "right")
+GROUND_TRUTH = Style("ground truth", "white", 1.9, "left")
+PREDICTION = Style("prediction", "#ff7f6e", 1.3, "right")
+# Styles of matched boxes. An object that was found has the label of its prediction.
+FOUND = Style("object, found", "white", 1.9, "")
+MISSED = Style("object, missed", "#ffd400", 1.9, "left")
+TRUE_POSITIVE = Style("true positive", "#5ce1ff", 1.3, "right")
+FALSE_POSITIVE = Style("false positive", "#ff7f6e", 1.3, "right")
+NOT_EVALUATED = Style("not evaluated", "#b0b0b0", 0.9, "")
+
+
+class Matches(NamedTuple):
+    """Matches between the boxes of one frame, by which they are colored.
+
+    A box is matched (1), not matched (0) or not evaluated (-1), as outside the region.
+
+    Attributes:
+        ground_truth: `[N]` matches of the objects.
+        predictions: `[M]` matches of the predictions.
+        iou: 3D IoU above which boxes match.
+    """
+
+    ground_truth: Int[np.ndarray, " N"]
+    predictions: Int[np.ndarray, " M"]
+    iou: float
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -82,6 +104,7 @@ class Scene:
         time_s: Seconds since the Unix epoch for recordings, or None.
         lidar_m: LiDAR points `[N, 3]` in the radar frame in meters, drawn on ground plane and
             image; or None.
+        matches: Matches of ground truth and predictions, which then both exist; or None.
 
     Raises:
         UserError: The projection does not match the grid, or the boxes belong to several
@@ -99,6 +122,7 @@ class Scene:
     score_threshold: float | None = None
     time_s: float | None = None
     lidar_m: Float[np.ndarray, "N 3"] | None = None
+    matches: Matches | None = None
 
     def __post_init__(self) -> None:
         shape = np.shape(self.projection)
@@ -117,8 +141,8 @@ class Scene:
 
     @property
     def sets(self) -> list[tuple[Style, Boxes]]:
-        """Ground truth and predictions with their styles; None is left out."""
-        return styled_sets(self.ground_truth, self.predictions)
+        """Ground truth and predictions with their styles, see `styled_sets`."""
+        return styled_sets(self.ground_truth, self.predictions, self.matches)
 
     @property
     def power(self) -> Float[np.ndarray, "R A"]:
@@ -128,11 +152,29 @@ class Scene:
 
 
 def styled_sets(
-    ground_truth: Boxes | None, predictions: Boxes | None
+    ground_truth: Boxes | None,
+    predictions: Boxes | None,
+    matches: Matches | None = None,
 ) -> list[tuple[Style, Boxes]]:
-    """Return ground truth and predictions with their styles; None is left out."""
+    """Return ground truth and predictions with their styles; None is left out.
+
+    With `matches`, they are split into those found, missed, correct, wrong and not
+    evaluated, of which the last are left out if there are none.
+    """
     pairs = (GROUND_TRUTH, ground_truth), (PREDICTION, predictions)
-    return [(style, boxes) for style, boxes in pairs if boxes is not None]
+    given = [(style, boxes) for style, boxes in pairs if boxes is not None]
+    if matches is None:
+        return given
+    (_, truth), (_, found) = given
+    sets = [
+        (NOT_EVALUATED, truth.take(matches.ground_truth < 0)),
+        (NOT_EVALUATED, found.take(matches.predictions < 0)),
+        (FOUND, truth.take(matches.ground_truth == 1)),
+        (MISSED, truth.take(matches.ground_truth == 0)),
+        (TRUE_POSITIVE, found.take(matches.predictions == 1)),
+        (FALSE_POSITIVE, found.take(matches.predictions == 0)),
+    ]
+    return [(style, x) for style, x in sets if style != NOT_EVALUATED or len(x)]
 
 
 def label_texts(boxes: Boxes) -> list[str]:
@@ -224,15 +266,8 @@ def halo(width: float, color: str = "black") -> list[AbstractPathEffect]:
 
 # Texts next to boxes -----------------------------------------------------------------
 
-# Sizes of DejaVu Sans, in units of the font size.
-_CHARACTER_WIDTH = 0.60
-_LINE_HEIGHT = 1.25
-_ALIGN = {
-    "left": ("right", -1, 0),
-    "right": ("left", 1, 0),
-    "above": ("center", 0, 1),
-    "below": ("center", 0, -1),
-}
+_LINE_HEIGHT = 1.25  # in units of the font size
+_SIDES = {"left": (-1, 0), "right": (1, 0), "above": (0, 1), "below": (0, -1)}
 
 
 class Label(NamedTuple):
@@ -252,11 +287,13 @@ class Label(NamedTuple):
 
 
 def draw_labels(ax: Axes, labels: Sequence[Label], font_size: float = 7.5) -> None:
-    """Write each text next to its outline, unless it would cover an earlier text.
+    """Write each text next to its outline, at a side where it covers no other text.
 
-    Labels whose outline has its center outside the axes are left out too, and others are
-    moved into the axes. The limits and
-    the aspect of the axes must be final, because overlaps are computed in pixels.
+    Among these sides, the one where it covers the fewest outlines is used, and the
+    label's own in a tie. A text that would cover another one at every side is left out, as
+    are those of outlines with their center outside the axes. Texts are moved into the
+    axes. The limits and the aspect of the axes must be final, because overlaps are
+    computed in pixels.
 
     Args:
         ax: Axes to draw on.
@@ -264,38 +301,47 @@ def draw_labels(ax: Axes, labels: Sequence[Label], font_size: float = 7.5) -> No
         font_size: Font size in points.
     """
     point = ax.figure.dpi / 72  # in pixels
-    gap = 3 * point
     low, high = ax.get_window_extent().get_points()
+    pixels = [ax.transData.transform(label.outline) for label in labels]
+    outlines = np.array([[*x.min(0), *x.max(0)] for x in pixels]).reshape(-1, 4)
     taken = np.zeros((0, 4))
-    for label in labels:
-        pixels = ax.transData.transform(label.outline)
-        first, last = pixels.min(0), pixels.max(0)
-        center = (first + last) / 2
-        align, right, up = _ALIGN[label.side]
-        size = np.array([_CHARACTER_WIDTH * len(label.text), _LINE_HEIGHT])
-        size *= font_size * point
-        offset = (last - first) / 2 + gap
-        middle = center + (right, up) * (offset + size / 2)
-        shift = np.clip(middle, low + size / 2, high - size / 2) - middle
-        middle = middle + shift
-        box = np.concatenate([middle - size / 2, middle + size / 2])
-        is_outside = (center < low).any() or (center > high).any()
-        is_covered = (taken[:, :2] < box[2:]).all(1) & (taken[:, 2:] > box[:2]).all(1)
-        if is_outside or is_covered.any():
+    for label, (*first, right, top) in zip(labels, outlines, strict=True):
+        extent = np.array([right, top]) - first
+        center = first + extent / 2
+        if (center < low).any() or (center > high).any():
             continue
-        taken = np.concatenate([taken, box[None]])
-        x, y = ax.transData.inverted().transform(center + (right, up) * offset + shift)
+        width = TextPath((0, 0), label.text, size=font_size).get_extents().width
+        size = point * np.array([width + 3, _LINE_HEIGHT * font_size])
+        sides = np.array([_SIDES[label.side], *_SIDES.values()])
+        middles = center + sides * (extent / 2 + 3 * point + size / 2)
+        middles = np.clip(middles, low + size / 2, high - size / 2)
+        texts = np.concatenate([middles - size / 2, middles + size / 2], 1)
+        is_free = ~_overlaps(texts, taken).any(1)
+        if not is_free.any():
+            continue
+        best = np.where(is_free, _overlaps(texts, outlines).sum(1), np.inf).argmin()
+        taken = np.concatenate([taken, texts[[best]]])
+        x, y = ax.transData.inverted().transform(middles[best])
         ax.text(
             x,
             y,
             label.text,
-            ha=align,
-            va=("center", "bottom", "top")[up],
+            ha="center",
+            va="center",
             color=label.color,
             fontsize=font_size,
-            path_effects=halo(1.6),
+            bbox={"facecolor": "black", "alpha": 0.6, "lw": 0, "pad": 1.0},
             zorder=6,
         )
+
+
+def _overlaps(
+    one: Float[np.ndarray, "N 4"], other: Float[np.ndarray, "M 4"]
+) -> Bool[np.ndarray, "N M"]:
+    """Return which rectangles (left, bottom, right, top) overlap."""
+    is_before = one[:, None, :2] < other[:, 2:]
+    is_after = one[:, None, 2:] > other[:, :2]
+    return np.all(is_before & is_after, axis=-1)
 
 
 # Figures ------------------------------------------------------------------------------
@@ -355,6 +401,10 @@ def save_figure(figure: Figure, path: PathLike) -> pathlib.Path:
     """
     path = as_path(path)
     suffix = figure_format(path)
-    with atomic_path(path) as temporary:
+    # Publishers require TrueType fonts; matplotlib embeds Type 3 fonts by default.
+    with (
+        atomic_path(path) as temporary,
+        matplotlib.rc_context({"pdf.fonttype": 42, "ps.fonttype": 42}),
+    ):
         figure.savefig(temporary, format=suffix)
     return path
