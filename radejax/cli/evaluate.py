@@ -203,12 +203,22 @@ def score(
     "runs", nargs=-1, required=True, type=entry.EXISTING, metavar="A B [C ...]"
 )
 @click.option("--out", help="Folder to write the comparison to. Default: none.")
+@click.option(
+    "--figures",
+    type=_FORMAT,
+    help="Also draw the curves of all runs in one panel and their scenes side by side into "
+    "--out. Default: none.",
+)
 @_DATA
 @_PREDICTIONS
 @_SETTINGS
 @entry.json_option
 def compare(
-    runs: tuple[str, ...], out: str | None, as_json: bool, **options: object
+    runs: tuple[str, ...],
+    out: str | None,
+    figures: str | None,
+    as_json: bool,
+    **options: object,
 ) -> None:
     """Compare runs with the first of them.
 
@@ -220,7 +230,18 @@ def compare(
     from radejax.evaluation.comparison import compare_files
 
     source, settings = _settings(runs[0], _given(options), bootstrap=2000)
-    text, rows = compare_files(runs, out, source, settings)
+    if figures and out is None:
+        raise UserError("--figures needs a folder: give --out FOLDER")
+    text, rows = compare_files(runs, out, source, settings, figures=figures)
+    if figures and out is not None:
+        from radejax.runs.figures import draw_compared
+
+        if not draw_compared(runs, pathlib.Path(out), source, settings, figures):
+            click.echo(
+                "no scenes are drawn: there are no radar data of the compared frames; give "
+                "--data ROOT, or runs that `radejax evaluate` has evaluated",
+                err=True,
+            )
     entry.echo_result(as_json, rows, text.rstrip("\n"))
 
 

@@ -283,15 +283,23 @@ def _check_same_truth(data_a: EvaluationSet, data_b: EvaluationSet) -> None:
 
 
 def comparison_tables(
-    rows: Sequence[Comparison], run_a: str, run_b: str, seeds: Iterable[int] = ()
+    rows: Sequence[Comparison],
+    run_a: str,
+    run_b: str,
+    seeds: Iterable[int] = (),
+    *,
+    name: str = "comparison",
 ) -> list[report.Table]:
     """Returns the tables of differences over all frames, by weather and by distance.
+
+    The higher AP of each row is bold.
 
     Args:
         rows: Result of `compare`.
         run_a: Name of run A.
         run_b: Name of run B.
         seeds: Numbers of seeds of both runs.
+        name: Beginning of the short names of the tables.
     """
     is_tested = any(row.is_significant is not None for row in rows)
     note = "over sequences; the variation between trainings is not counted"
@@ -319,7 +327,13 @@ def comparison_tables(
             body.append([row.condition, row.cls, protocol, metric, *values])
         by = "all frames" if kind == "all" else f"by {kind}"
         title = f"B = {run_b} against A = {run_a}, {by}: {note}"
-        built.append(report.Table(title, [kind.capitalize(), *header], body))
+        best = {
+            (i, 5 if float(row[5]) > float(row[4]) else 4)
+            for i, row in enumerate(body)
+            if row[4] != row[5]
+        }
+        head = [kind.capitalize(), *header]
+        built.append(report.Table(f"{name}-{kind}", title, head, body, best))
     return built
 
 
@@ -328,6 +342,8 @@ def compare_files(
     out_dir: PathLike | None,
     source: Source,
     options: ReportOptions,
+    *,
+    figures: str | None = None,
 ) -> tuple[str, list[JsonObject]]:
     """Compares each run with the first one on the same frames.
 
@@ -337,6 +353,8 @@ def compare_files(
         out_dir: Folder for comparison.txt, .md, .tex and .json, or None.
         source: Source of the ground truth for paths that do not contain it.
         options: Settings of the evaluation, see `compare`.
+        figures: Format of figures of the precision-recall curves, such as "pdf"; None draws
+            none. They need `out_dir`.
 
     Returns:
         The tables as text, and the fields of all comparisons in the order of the runs.
@@ -357,11 +375,14 @@ def compare_files(
     names = [str(path) for path in paths]
     first, frames = _load_run(folders[0], source, options)
     others = [_load_run(run, source, options, frames) for run in folders[1:]]
+    loaded = [(first, frames), *others]
     built = []
     rows = []
-    for name, (sets, _) in zip(names[1:], others, strict=True):
+    for i, (sets, _) in enumerate(others, 1):
         found = compare(first, sets, frames, options)
-        built += comparison_tables(found, names[0], name, (len(first), len(sets)))
+        label = "comparison" if len(others) == 1 else f"comparison-{i}"
+        counts = len(first), len(sets)
+        built += comparison_tables(found, names[0], names[i], counts, name=label)
         rows += [report.plain(dataclasses.asdict(row)) for row in found]
     is_simulated = next(iter(first.values())).is_simulated
     text = report.rendered(built, is_simulated=is_simulated)
@@ -371,7 +392,52 @@ def compare_files(
         files.write_text(place.with_suffix(".txt"), text)
         files.write_json(place.with_suffix(".json"), content)
         report.write_tables(place, built, is_simulated=is_simulated)
+        if figures:
+            runs = dict(zip(short_names(paths), (x for x, _ in loaded), strict=True))
+            _draw_curves(runs, options, pathlib.Path(out_dir), figures)
     return text, rows
+
+
+def short_names(paths: Sequence[PathLike]) -> list[str]:
+    """Returns the last parts of the paths, or whole paths where these are not unique.
+
+    Examples:
+        >>> short_names(["runs/a", "runs/b"])
+        ['a', 'b']
+    """
+    names = [pathlib.Path(path).name for path in paths]
+    return names if len({*names}) == len(names) else [str(path) for path in paths]
+
+
+def _draw_curves(
+    runs: Mapping[str, Run], options: ReportOptions, folder: pathlib.Path, ending: str
+) -> None:
+    """Draws a panel for each class that occurs with one curve per run, for each space."""
+    from radejax.visualize.curves import Curve, draw_precision_recall
+    from radejax.visualize.style import save_figure
+
+    protocol = protocols.RECOMMENDED
+    iou = options.iou_thresholds[0]
+    settings = options.settings_of(protocol)
+    is_simulated = next(x for run in runs.values() for x in run.values()).is_simulated
+    for space in SPACES:
+        panels: dict[str, dict[str, Curve]] = {}
+        for name, run in runs.items():
+            of_seeds = [
+                data.results(protocol, spaces=space, iou_thresholds=iou, **settings)
+                for data in run.values()
+            ]
+            for found in zip(*of_seeds, strict=True):
+                if found[0].is_defined:
+                    ap = np.mean([result.ap for result in found])
+                    title = f"{found[0].cls}, {found[0].num_gt:,} objects"
+                    lines = panels.setdefault(title, {})
+                    lines[f"{name}: AP {ap:.1f}"] = protocols.mean_curve(found)
+        title = f"{protocol}, {space.upper()}, IoU {iou:g}"
+        title += ", simulated data" if is_simulated else ""
+        figure = draw_precision_recall(panels, title)
+        name = f"comparison_{space}_iou{100 * iou:.4g}.{ending}"
+        save_figure(figure, folder / name)
 
 
 def _load_run(

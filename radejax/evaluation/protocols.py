@@ -7,6 +7,7 @@ All computations are exact for weighted frames: a weight of 0 ignores a frame, a
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -130,6 +131,28 @@ class Curve:
     def ap_or_none(self) -> float | None:
         """AP, or None in every protocol if the class does not occur."""
         return self.ap if self.is_defined else None
+
+
+def mean_curve(
+    curves: Sequence[Curve],
+) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, " K"]]:
+    """Computes recall and interpolated precision of the mean curve, as of several seeds.
+
+    The area under the mean is the mean AP in `all_point`.
+
+    Examples:
+        >>> one = Curve(50.0, 2, 1, np.ones(1), np.array([0.5]), np.ones(1))
+        >>> all_found = Curve(100.0, 2, 2, np.ones(2), np.array([0.5, 1.0]), np.ones(2))
+        >>> mean_curve([one, all_found])[1].tolist()
+        [1.0, 0.5]
+    """
+    recall = np.unique(np.concatenate([curve.recall for curve in curves]))
+    heights = []
+    for curve in curves:
+        height = np.maximum.accumulate(curve.precision[::-1])[::-1]
+        at = np.searchsorted(curve.recall, recall)
+        heights.append(np.append(height, 0.0)[at])
+    return recall, np.mean(heights, axis=0)
 
 
 def score_thresholds(

@@ -28,7 +28,12 @@ from radejax.core.structures import Batch, Boxes, DetectionMaps
 from radejax.data.cameras import require_images
 from radejax.data.dataset import FrameSequence, LabelledFrame, find_reader
 from radejax.data.projection import decode
-from radejax.evaluation.analysis import box_errors, mistakes, worst_frames
+from radejax.evaluation.analysis import (
+    OPERATING_SCORE,
+    box_errors,
+    mistakes,
+    worst_frames,
+)
 from radejax.evaluation.boxes import roi_bounds, roi_name, tables_from_frames
 from radejax.evaluation.evaluation_set import EvaluationSet, Result
 from radejax.evaluation.html import Picture
@@ -287,7 +292,8 @@ class Evaluation:
                 "mistake": list(made),
             }
             text = ", ".join(f"{kind}: {count}" for kind, count in made.items())
-            yield Picture(f"{name} ({text or 'no mistakes'})", tags, figure)
+            title = f"{name}, score > {OPERATING_SCORE:g}: {text or 'no mistakes'}"
+            yield Picture(title, tags, figure)
 
     def _write_figures(
         self, predictions: Boxes, workdir: pathlib.Path, folder: pathlib.Path

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pathlib
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, TypeVar
 
@@ -15,23 +16,29 @@ from numpy.typing import ArrayLike
 
 from radejax import models
 from radejax.config import Config
+from radejax.core import files
 from radejax.core.files import JsonObject
 from radejax.core.structures import CLASSES, Array, Batch, Boxes
 from radejax.data.cameras import front_view
-from radejax.data.dataset import FrameSequence, LabelledFrame
+from radejax.data.dataset import FrameSequence, LabelledFrame, find_reader
+from radejax.data.options import DataOptions
 from radejax.data.pipeline import read_sample, sample_keys
 from radejax.data.projection import decode
-from radejax.evaluation.boxes import roi_bounds
+from radejax.data.records import open_projections
+from radejax.evaluation.analysis import OPERATING_SCORE
+from radejax.evaluation.boxes import ids_by_name, roi_bounds
+from radejax.evaluation.comparison import short_names
 from radejax.evaluation.evaluation_set import EvaluationSet
-from radejax.evaluation.results import condition_masks, repair_sizes
+from radejax.evaluation.files import Source, load, report_folders
+from radejax.evaluation.results import ReportOptions, condition_masks, repair_sizes
 from radejax.geometry.boxes import boxes7_from_8
 from radejax.geometry.camera import Camera, CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.focal import gaussian_heatmap
 from radejax.models.radenet import RadeNet
 from radejax.runs.data import Data, located, open_data
-from radejax.visualize.draw import draw_samples
-from radejax.visualize.style import Matches, Scene
+from radejax.visualize.draw import draw_samples, draw_scenes
+from radejax.visualize.style import Matches, Scene, save_figure
 
 T = TypeVar("T")
 
@@ -148,6 +155,75 @@ def fullest_of_weathers(frames: FrameSequence) -> dict[str, int]:
     table = {"weather": [frame.weather for frame in frames]}
     masks = condition_masks(table, "weather")
     return {name: int(np.where(m, counts, -1).argmax()) for name, m in masks.items()}
+
+
+def draw_compared(
+    paths: Sequence[files.PathLike],
+    out_dir: pathlib.Path,
+    source: Source,
+    options: ReportOptions,
+    ending: str,
+) -> int:
+    """Draw a frame of each weather with the detections of several runs side by side.
+
+    It is the evaluated frame with the most objects, and the detections are those above the
+    operating score. Of a run with several seeds, the first one is drawn.
+
+    Args:
+        paths: Runs, reports or predictions as for `compare_files`.
+        out_dir: Folder of the figures, which are named after the weathers.
+        source: Source of the ground truth. Its data replace those of the runs.
+        options: Settings of the comparison.
+        ending: Format of the figures, such as "pdf".
+
+    Returns:
+        The number of figures, which is 0 if there are no radar data of these frames.
+    """
+    folders = [next(iter(report_folders(path).values())) for path in paths]
+    made_from = [folder / "source.json" for folder in folders]
+    if source.data:
+        given = {name: getattr(source, name) for name in ("labels", "label_version")}
+        data_options = DataOptions(roots=source.data, **given)
+    elif there := [path for path in made_from if path.is_file()]:
+        stored = files.read_object(there[0])
+        fields = stored.keys() & DataOptions.model_fields.keys()
+        data_options = DataOptions(**{name: stored[name] for name in fields})
+    else:
+        return 0
+    reader = find_reader(data_options.format)
+    dataset = reader.from_options(data_options, options.classes)
+    records = data_options.records and open_projections(data_options.records)
+    frames = {frame.key: frame for frame in dataset}
+    runs = {}
+    for name, folder in zip(short_names(paths), folders, strict=True):
+        _, found, table, _ = load(folder, source, options.classes)
+        assert found.score is not None
+        runs[name] = found.take(found.score > OPERATING_SCORE)
+    ids = {key: i for key, i in ids_by_name(table).items() if key in frames}
+    evaluated = [frames[key] for key in ids]
+    fullest = fullest_of_weathers(evaluated)
+    for weather, index in fullest.items():
+        frame = evaluated[index]
+        if records:
+            grid, projection = records.grid, decode(records[frame.key])
+        else:
+            grid, projection = dataset.grid, frame.read_projection(dataset.grid)
+        suffix = ", simulated" if frame.is_simulated else ""
+        scenes = [
+            frame_scene(
+                frame,
+                projection,
+                grid,
+                iou=options.iou_thresholds[0],
+                predictions=found.take(found.frame == ids[frame.key]),
+                roi=roi_bounds(options.roi),
+                score_threshold=OPERATING_SCORE,
+                title=f"{name}: {weather} ({frame.key}){suffix}",
+            )
+            for name, found in runs.items()
+        ]
+        save_figure(draw_scenes(scenes), out_dir / f"scenes_{weather}.{ending}")
+    return len(fullest)
 
 
 def spread(values: Sequence[T], count: int) -> list[T]:

@@ -38,8 +38,8 @@ def draw_precision_recall(
         panels: Curves by name for the title of each panel; at least one panel.
         title: Title of the figure.
     """
-    columns = min(len(panels), 4)
-    rows = -(-len(panels) // columns)
+    rows = -(-len(panels) // 4)
+    columns = -(-len(panels) // rows)
     figure = new_figure(3.8 * columns, 4.4 * rows, layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False).reshape(-1)
     for ax in axes[len(panels) :]:

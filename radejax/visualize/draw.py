@@ -205,7 +205,7 @@ def draw_frame(scene: Scene) -> Figure:
     _draw_polar(polar_ax, scene, show_labels=not has_image)
     if has_image:
         _draw_view(figure.add_axes((0.53, 0.43, 0.45, 0.49)), scene)
-    place = (0.765, 0.095 + height)
+    place = (0.75, 0.095 + height)
     _add_legend(figure, scene, loc="lower center", bbox_to_anchor=place, ncols=4)
     figure.suptitle(scene.title)
     return figure
@@ -215,7 +215,7 @@ def draw_scenes(scenes: Sequence[Scene]) -> Figure:
     """Draw scenes, four per row, each with its camera image above its map.
 
     Args:
-        scenes: One or more scenes. The legend is taken from the first one.
+        scenes: One or more scenes. The legend is that of the scene with most kinds of boxes.
     """
     columns = min(4, len(scenes))
     width = _COLUMN_IN * columns
@@ -253,7 +253,7 @@ def draw_scenes(scenes: Sequence[Scene]) -> Figure:
     bar.ax.tick_params(labelsize=8)
     _add_legend(
         figure,
-        scenes[0],
+        max(scenes, key=lambda scene: len(scene.sets)),
         show_counts=False,
         loc="lower left",
         bbox_to_anchor=(0.3 / width, (foot_in - _FOOT_IN + 0.2) / height),
@@ -420,11 +420,11 @@ def _add_legend(
     if scene.score_threshold is not None and scene.predictions is not None:
         terms.append(f"score ≥ {scene.score_threshold:g}")
     if scene.matches is not None:
-        terms.append(f"3D IoU > {scene.matches.iou:g}")
+        terms.append(f"IoU > {scene.matches.iou:g}")
     if terms:
         handles.append(Line2D([], [], ls="", label=", ".join(terms)))
     # Counts, threshold and region fit in these sizes.
-    place |= {"fontsize": 8, "handlelength": 1.6, "columnspacing": 1.2}
+    place |= {"fontsize": 7.5, "handlelength": 1.6, "columnspacing": 1.2}
     owner.legend(handles=handles, frameon=False, **place)
 
 
