@@ -341,8 +341,7 @@ def _overlaps(
     """Return which rectangles (left, bottom, right, top) overlap."""
     is_before = one[:, None, :2] < other[:, 2:]
     is_after = one[:, None, 2:] > other[:, :2]
-    overlaps: np.ndarray = (is_before & is_after).all(-1)
-    return overlaps
+    return np.asarray((is_before & is_after).all(-1))
 
 
 # Figures ------------------------------------------------------------------------------
