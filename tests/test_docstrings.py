@@ -12,7 +12,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[1]
 PURE = ("geometry", "losses", "detection", "evaluation")
 """Packages of functions from arrays to arrays."""
 
-REPORTS = ("comparison", "files", "kitti", "report", "results")
+REPORTS = ("comparison", "files", "html", "kitti", "report", "results")
 """Modules of `evaluation` that read, write or compose reports."""
 
 Documented = ast.FunctionDef | ast.ClassDef

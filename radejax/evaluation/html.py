@@ -16,8 +16,6 @@ from radejax.core.files import JsonObject
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from radejax.evaluation.report import Table
-
 MAX_BYTES = 9_000_000
 """Scenes are left out if the file would be larger."""
 
@@ -41,7 +39,7 @@ class Picture(NamedTuple):
 def write_html(
     path: pathlib.Path,
     metrics: JsonObject,
-    tables: Sequence[Table],
+    tables: Sequence[object],
     curves: Mapping[str, Figure],
     scenes: Iterable[Picture],
 ) -> None:
@@ -50,7 +48,7 @@ def write_html(
     Args:
         path: File to write.
         metrics: Content of metrics.json.
-        tables: Tables of the report.
+        tables: Tables of the report, see `report.Table`.
         curves: Figures of curves by name.
         scenes: Figures of frames in descending order of importance. Those for which the
             file has no space are counted in it.

@@ -258,7 +258,12 @@ def _draw_curves(
 
 
 def curve_label(name: str, ap: float, num_gt: int) -> str:
-    """Returns the label of a precision-recall curve with its AP and number of objects."""
+    """Returns the label of a precision-recall curve with its AP and number of objects.
+
+    Examples:
+        >>> curve_label("Sedan", 61.25, 1843)
+        'Sedan: AP 61.2, 1,843 objects'
+    """
     return f"{name}: AP {ap:.1f}, {num_gt:,} objects"
 
 
@@ -317,7 +322,7 @@ class Table:
         """Renders the table as "text", "markdown" or "latex" (with caption and label)."""
         align = ["left", *["right"] * (len(self.header) - 1)]
         # The LaTeX command is inserted below, as tabulate escapes it.
-        marks = {"markdown": "**", "latex": "\x01"}
+        marks = {"markdown": "**", "latex": "\ue000"}
         mark = marks.get(style, "")
         rows = [
             [
@@ -331,7 +336,7 @@ class Table:
         )
         title = f"Simulated data: {self.title}" if is_simulated else self.title
         if style == "latex":
-            body = re.sub("\x01(.*?)\x01", r"\\textbf{\1}", body)
+            body = re.sub("\ue000(.*?)\ue000", r"\\textbf{\1}", body)
             caption = "".join(LATEX_ESCAPE_RULES.get(x, x) for x in title)
             head = f"\\caption{{{caption}}}\n\\label{{tab:{self.label}}}\n"
             return f"\\begin{{table}}\n{head}{body}\n\\end{{table}}\n"
@@ -362,7 +367,12 @@ def number(value: float | None, *, signed: bool = False, digits: int = 2) -> str
 def best_rows(
     body: Sequence[Sequence[str]], rows: Iterable[int], column: int
 ) -> set[tuple[int, int]]:
-    """Returns the places of the largest of several numbers in a column of a table."""
+    """Returns the places of the largest of several numbers in a column of a table.
+
+    Examples:
+        >>> best_rows([["A", "0.5"], ["B", "-"], ["C", "0.7"]], range(3), 1)
+        {(2, 1)}
+    """
     values = {i: float(body[i][column]) for i in rows if body[i][column] != "-"}
     largest = max(values.values(), default=0.0)
     return {(i, column) for i, x in values.items() if x == largest and len(values) > 1}

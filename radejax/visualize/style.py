@@ -341,7 +341,8 @@ def _overlaps(
     """Return which rectangles (left, bottom, right, top) overlap."""
     is_before = one[:, None, :2] < other[:, 2:]
     is_after = one[:, None, 2:] > other[:, :2]
-    return np.asarray((is_before & is_after).all(-1))
+    overlaps: np.ndarray = np.all(is_before & is_after, axis=-1)
+    return overlaps
 
 
 # Figures ------------------------------------------------------------------------------

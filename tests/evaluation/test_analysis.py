@@ -58,6 +58,28 @@ def _numbers(data, kind, frames=FRAMES):
     return {(entry[kind], entry["cls"]): entry for entry in entries}
 
 
+def test_every_kind_of_mistake_is_counted():
+    data = make(
+        [(0, "Sedan", 20.0, 0), (0, "Sedan", 40.0, 0), (1, "Bus or Truck", 50.0, 0)],
+        [
+            (0, "Sedan", 20.0, 0, 0.9),
+            (0, "Sedan", 20.5, 0, 0.8),  # the same object again
+            (0, "Sedan", 43.0, 0, 0.7),  # IoU 1 / 7
+            (0, "Sedan", 60.0, 0, 0.6),
+            (0, "Sedan", 80.0, 0, 0.2),  # below the operating score
+            (1, "Sedan", 50.0, 0, 0.5),
+        ],
+    )
+    counts = analysis.mistakes(data, 0.3)
+    assert {kind: x.tolist()[:2] for kind, x in counts.items()} == {
+        "missed": [[1, 0], [0, 1]],
+        "duplicate": [[1, 0], [0, 0]],
+        "wrong class": [[0, 0], [1, 0]],
+        "poor box": [[1, 0], [0, 0]],
+        "background": [[1, 0], [0, 0]],
+    }
+
+
 def test_by_distance_by_hand(data):
     numbers = _numbers(data, "distance")
     near = numbers["0-20 m", "Sedan"]

@@ -42,11 +42,14 @@ def test_texts_are_the_stored_ones(written, assert_stored):
     assert {path.name for path in out.iterdir()} == {
         *("metrics.json", "metrics.csv", "report.txt", "tables.md", "tables.tex"),
         *("tables", "predictions.npz", "ground_truth.npz", "frames.json"),
+        "report.html",
     }
     # Each LaTeX table has its own file, named after its label.
     labels = re.findall(r"\\label{tab:(.*)}", (out / "tables.tex").read_text())
     assert {f"{label}.tex" for label in labels} == set(os.listdir(out / "tables"))
-    assert len(labels) == (out / "tables.md").read_text().count("**") / 2
+    assert len(labels) == len(re.findall(r"(?m)^\*\*", (out / "tables.md").read_text()))
+    assert len(set(labels)) == len(labels)
+    assert max(map(len, labels)) < 30
 
 
 def test_simulated_frames_have_no_published_row_anywhere(
@@ -144,13 +147,20 @@ def test_curves_are_drawn_of_classes_that_occur(scene, tmp_path, monkeypatch):
     from radejax.visualize import curves, style
 
     drawn = []
-    monkeypatch.setattr(curves, "draw_precision_recall", drawn.append)
+
+    def draw(panels, title):
+        drawn.append((panels, title))
+        return style.new_figure(1, 1)
+
+    monkeypatch.setattr(curves, "draw_precision_recall", draw)
     monkeypatch.setattr(style, "save_figure", lambda *_: None)
     report.write_report(*scene, tmp_path, OPTIONS.replace(plots=True))
-    titles = [f"{cls}, all_point, 3d, IoU 0.3" for cls in ("Sedan", "Bus or Truck")]
-    assert list(drawn[0]) == titles
-    lines = drawn[0][titles[0]]
-    assert [name.split(",")[0] for name in lines] == ["all", "normal", "fog", "rain"]
+    panels, title = drawn[0]
+    assert title == "all_point, 3D, IoU 0.3"
+    assert list(panels) == ["Total", "Normal", "Fog", "Rain"]
     data = EvaluationSet(*scene[:2], frames=scene[2])
     whole = data.results("all_point", iou_thresholds=0.3, spaces="3d")[0]
-    np.testing.assert_array_equal(lines[f"all, AP {whole.ap:.1f}"][0], whole.recall)
+    label = f"Sedan: AP {whole.ap:.1f}, {whole.num_gt} objects"
+    np.testing.assert_array_equal(panels["Total"][label][0], whole.recall)
+    (absent,) = (x for name, x in panels["Total"].items() if "Bicycle" in name)
+    assert absent is None

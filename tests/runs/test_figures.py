@@ -1,17 +1,25 @@
 """Figures of a run: which frames in which order, and what a sample looks like."""
 
+import dataclasses
+import json
 import pathlib
 from types import SimpleNamespace
 from typing import Any
 
+import click.testing
 import numpy as np
 import pytest
 
+from radejax.cli.main import main
 from radejax.config import load_config
+from radejax.core.structures import NARROW_ROI, Boxes
 from radejax.data.kradar import KRadar
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.runs import figures
 from radejax.runs.figures import draw_training_samples, frame_scene
+from radejax.simulation.config import SimulationOptions
+from radejax.simulation.dataset import simulate_dataset
+from radejax.visualize.draw import draw_scenes
 from radejax.visualize.style import Scene
 
 from .. import small_models as small
@@ -91,3 +99,87 @@ def test_bins_out_of_view_and_frames_without_image_do_not_count() -> None:
         "rain": {"mean": pytest.approx(0.6), "frames": 1},
         "snow": {"mean": None, "frames": 0},
     }
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+    """Two simulated sequences of one frame."""
+    options = SimulationOptions(
+        train_sequences=0,
+        test_sequences=2,
+        frames_per_sequence=1,
+        output="projection",
+    )
+    folder = tmp_path_factory.mktemp("compared") / "data"
+    return simulate_dataset(options, folder, progress=False)
+
+
+def test_scenes_show_which_boxes_match(root: pathlib.Path) -> None:
+    frames = KRadar([root])
+    frame = frames[0]
+    box = np.array([[10.0, 0, 0, 4, 2, 1.5, 0], [30, 0, 0, 4, 2, 1.5, 0]])
+    far = [[50.0, 60.0, 0, 4, 2, 1.5, 0]]  # outside the region
+    frame = dataclasses.replace(
+        frame, boxes=np.concatenate([box, far]), classes=np.array(["Sedan"] * 3)
+    )
+    found = Boxes.one_frame([far[0], box[1]], ["Sedan"] * 2, [0.9, 0.8])
+    projection = frame.read_projection(frames.grid)
+    scene = figures.frame_scene(
+        frame, projection, frames.grid, predictions=found, roi=NARROW_ROI, iou=0.5
+    )
+    assert scene.matches is not None
+    assert scene.matches.ground_truth.tolist() == [0, 1, -1]
+    assert scene.matches.predictions.tolist() == [-1, 1]
+    assert scene.matches.iou == 0.5
+    none = Boxes.one_frame([], [], [])
+    scene = figures.frame_scene(frame, projection, frames.grid, predictions=none)
+    assert scene.matches is not None
+    assert scene.matches.ground_truth.tolist() == [0, 0, 0]
+
+
+def test_compared_runs_are_drawn_side_by_side(
+    root: pathlib.Path, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames = KRadar([root])
+    rows = [
+        {"frame": frame.key, "cls": str(cls), "box": box.tolist(), "score": 0.5}
+        for frame in frames
+        for cls, box in zip(frame.classes, frame.boxes, strict=True)
+    ]
+    paths = tmp_path / "all.json", tmp_path / "few.json"
+    paths[0].write_text(json.dumps(rows))
+    paths[1].write_text(json.dumps(rows[::2]))
+    drawn: list[list[Scene]] = []
+    monkeypatch.setattr(
+        figures, "draw_scenes", lambda x: drawn.append(x) or draw_scenes(x)
+    )
+    words = ["compare", *paths, "--data", root, "--bootstrap", 5, "--figures", "pdf"]
+    runner = click.testing.CliRunner()
+    done = runner.invoke(main, list(map(str, words)))
+    assert "--figures needs a folder" in done.stderr
+    words += ["--out", tmp_path / "out", "--roi", "wide"]
+    done = runner.invoke(main, list(map(str, words)))
+    assert done.exit_code == 0, done.output
+    names = {path.name for path in (tmp_path / "out").glob("*.pdf")}
+    curves = {"comparison_3d_iou30.pdf", "comparison_bev_iou30.pdf"}
+    assert names == curves | {f"scenes_{frame.weather}.pdf" for frame in frames}
+    for one, other in drawn:
+        assert one.title.startswith("all.json: ")
+        assert other.title.startswith("few.json: ")
+        assert one.matches is not None
+        assert (one.matches.ground_truth != 0).all()  # all is found
+    # Ground truth in a file has no radar data.
+    monkeypatch.setattr(figures, "draw_scenes", None)
+    truth = tmp_path / "truth.json"
+    truth.write_text(json.dumps(rows))
+    table = {"frame": [0, 1], "sequence": [1, 2], "name": ["a", "b"]}
+    (tmp_path / "frames.json").write_text(json.dumps(table))
+    for path in (*paths, truth):
+        text = path.read_text()
+        for i, frame in enumerate(frames):
+            text = text.replace(f'"{frame.key}"', str(i))
+        path.write_text(text)
+    words[words.index("--data") : words.index("--data") + 2] = ["--ground-truth", truth]
+    done = runner.invoke(main, list(map(str, words)))
+    assert done.exit_code == 0, done.output
+    assert "no scenes are drawn" in done.stderr

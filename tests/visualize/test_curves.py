@@ -8,13 +8,16 @@ from radejax.visualize import curves
 from radejax.visualize.style import SERIES_COLORS
 
 
-def test_precision_over_recall_in_order_of_recall():
-    curve = np.array([0.5, 0.1]), np.array([0.8, 1.0])
+def test_interpolated_precision_in_order_of_recall():
+    curve = np.array([0.5, 0.1, 0.2]), np.array([0.8, 0.6, 0.5])
     panels = {"AP": {"all": curve, "fog": None, "rain": curve}, "B": {"all": curve}}
     figure = curves.draw_precision_recall(panels | {"C": {"all": ([0, 0], [0, 0])}})
     one, two, three = figure.axes
     assert [ax.get_title() for ax in figure.axes] == ["AP", "B", "C"]
-    np.testing.assert_array_equal(one.lines[0].get_xydata(), [[0.1, 1.0], [0.5, 0.8]])
+    x, y = one.lines[0].get_data()
+    np.testing.assert_array_equal(x, [0, 0.1, 0.2, 0.5, 0.5])
+    np.testing.assert_array_equal(y, [0.8, 0.8, 0.8, 0.8, 0])
+    assert one.lines[0].get_drawstyle() == "steps-pre"  # the area is the AP
     assert [line.get_label() for line in one.lines] == ["all", "rain"]
     # Fog has a color of its own where it is not drawn: rain's is the third.
     assert one.lines[1].get_color() == SERIES_COLORS[2]

@@ -1,5 +1,6 @@
 import concurrent.futures
 import dataclasses
+import itertools
 import sys
 
 import numpy as np
@@ -10,7 +11,7 @@ from matplotlib.collections import LineCollection, QuadMesh
 from radejax.core.errors import UserError
 from radejax.core.structures import Boxes
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.visualize import draw
+from radejax.visualize import draw, style
 from radejax.visualize.style import COLOR_MAP, Scene, save_figure
 
 from .. import small_models as small
@@ -70,13 +71,41 @@ def test_bev_shows_boxes_headings_region_and_legend():
     assert other[1][:, 1] == pytest.approx([22.0, 23.4])
     assert {t.get_text() for t in ax.texts} == {"Sedan", "Bus or Truck 0.88"}
     legend = [t.get_text() for t in ax.get_legend().get_texts()]
-    found = "prediction (1), score ≥ 0.3"
-    assert legend == ["ground truth (1)", found, "wide region"]
+    expected = ["ground truth (1)", "prediction (1)", "wide region", "score ≥ 0.3"]
+    assert legend == expected
     y, x = next(line for line in ax.lines if line.is_dashed()).get_data()
     assert (min(x), max(x), min(y), max(y)) == pytest.approx(ROI[:4])
     assert "[m]" in ax.get_xlabel()
     labels = [a.get_ylabel() for a in [*ax.figure.axes, *ax.child_axes]]
     assert draw.POWER_LABEL in labels
+
+
+def test_outcomes_have_their_own_colors_and_labels_do_not_overlap():
+    x_m = np.array([10.0, 16.0, 22.0, 30.0])
+    box = np.tile([0.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0], (4, 1))
+    box[:, 0] = x_m
+    truth = Boxes.one_frame(box, ["Sedan"] * 4)
+    found = Boxes.one_frame(box, ["Bus or Truck"] * 4, [0.9, 0.8, 0.7, 0.6])
+    matches = style.Matches(np.array([1, 0, 0, -1]), np.array([1, 0, 0, 0]), 0.3)
+    drawn = scene(ground_truth=truth, predictions=found, matches=matches)
+    counts = {look.name: len(boxes) for look, boxes in drawn.sets}
+    assert counts == {
+        "not evaluated": 1,
+        "object, found": 1,
+        "object, missed": 2,
+        "true positive": 1,
+        "false positive": 3,
+    }
+    colors = [look.color for look, _ in drawn.sets]
+    assert len(set(colors)) == len(colors)
+    ax = draw.draw_bev(drawn)
+    assert len(ax.texts) == 6  # of what is missed and predicted
+    FigureCanvasAgg(ax.figure).draw()
+    extents = [text.get_window_extent() for text in ax.texts]
+    assert not any(a.overlaps(b) for a, b in itertools.combinations(extents, 2))
+    legend = [t.get_text() for t in ax.get_legend().get_texts()]
+    assert "object, missed (2)" in legend
+    assert legend[-1] == "IoU > 0.3"
 
 
 def test_drawing_leaves_pyplot_alone_and_works_in_threads(tmp_path):

@@ -31,7 +31,7 @@ def test_gif_has_every_frame_in_order(tmp_path):
         for i in range(3):
             gif.seek(i)
             seen.append(gif.convert("RGB").getpixel((25, 20)))
-    assert seen == [(255, 255, 255), (255, 77, 64), (0, 0, 0)]
+    assert seen == [(255, 255, 255), (255, 127, 110), (0, 0, 0)]
     assert [p.name for p in tmp_path.iterdir()] == ["a.gif"]
 
 

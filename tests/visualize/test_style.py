@@ -43,7 +43,11 @@ def test_figures_are_saved_whole_or_not_at_all(tmp_path, monkeypatch):
     figure = style.new_figure(2, 2)
     path = style.save_figure(figure, tmp_path / "a" / "b.png")
     assert path.read_bytes().startswith(b"\x89PNG")
+    figure.suptitle("title")
     style.save_figure(figure, path.with_suffix(".pdf"))
+    embedded = path.with_suffix(".pdf").read_bytes()
+    assert b"/FontFile2" in embedded  # TrueType
+    assert b"/Type3" not in embedded
     with pytest.raises(UserError, match="png"):
         style.save_figure(figure, path.with_suffix(".xyz"))
     before = path.read_bytes()
