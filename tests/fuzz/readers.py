@@ -7,7 +7,8 @@ import shutil
 import numpy as np
 import safetensors.numpy
 
-from radejax.data.kradar import KRadar, conditions, folders, labels, write
+from radejax.core import files
+from radejax.data.kradar import KRadar, conditions, folders, labels, motion, write
 from radejax.data.kradar.tesseract import project_file, read_projection_npy
 from radejax.geometry.camera import CameraCalibration
 from radejax.inference.saved import load_torch
@@ -28,6 +29,8 @@ def _rng() -> np.random.Generator:
 
 def _root(folder: Folder) -> None:
     write_kradar(folder, sequences=(1,), num_frames=2, grid=GRID)
+    table = f"{motion.OBJECT_HEADER}\n00004_00001,Sedan,0,1.5,-0.5\n"
+    files.write_text(folder / "1/info_motion/objects.csv", table)
     (folder / "1/cam_1.yml").write_text(small.calibration().to_kradar_text())
 
 
