@@ -92,7 +92,7 @@ class LabelledFrame:
         boxes: x, y, z, l, w, h, yaw in the radar frame, in meters and radians.
         classes: Class names of `boxes`.
         columns: Further values of the objects by name, one row per box. K-Radar's reader
-            has "track_id", "velocity_mps" and "visibility".
+            has "track_id", "velocity_mps", "speed_mps" and "visibility".
         environment, time, weather: Conditions by which results are tabulated.
         radar_path: File of the radar tensor, or None if it is missing.
         camera_path: Image of the (left) front camera, or None if it is missing.

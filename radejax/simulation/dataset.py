@@ -215,12 +215,14 @@ class Writer:
             moved = frame.ego_velocity_mps[0], frame.ego_yaw_rate_radps
             numbers = spec.timestamp_s, *sequence.ego_pose[spec.scene_idx], *moved
             ego.append(",".join([spec.name, *(f"{x:.6f}" for x in numbers)]))
-            for n, (vx, vy) in zip(
-                frame.track, frame.relative_velocity_mps, strict=True
-            ):
+            speed = np.linalg.norm(frame.velocity_mps, axis=1)
+            columns = (*frame.relative_velocity_mps.T, speed)
+            for n, *motion_mps in zip(frame.track, *columns, strict=True):
                 if (track_id := tracks.track_id[n]) >= 0:
                     identity = f"{spec.name},{tracks.label_cls[n]},{track_id}"
-                    objects.append(f"{identity},{vx:.6f},{vy:.6f}")
+                    objects.append(
+                        ",".join([identity, *map("{:.6f}".format, motion_mps)])
+                    )
         files.write_text(folder / "ego.csv", "\n".join([*ego, ""]))
         files.write_text(folder / "objects.csv", "\n".join([*objects, ""]))
 

@@ -149,6 +149,7 @@ class TestTree:
             tracks = frame.columns["track_id"] - 1  # of procedural sequences
             expected = scene.tracks.velocity_mps[index, tracks]
             speed = np.linalg.norm(velocity, axis=1)
+            np.testing.assert_allclose(frame.columns["speed_mps"], speed, atol=1e-4)
             np.testing.assert_allclose(
                 speed, np.linalg.norm(expected, axis=1), atol=0.1
             )

@@ -63,7 +63,8 @@ class Frame(LabelledFrame):
     are "track_id" (-1 if unknown), "visibility" (the flag) and "velocity_mps" `[N, 2]`: the
     change of x and y over time in the radar frame, so relative to the radar. It is read
     from the files of simulated sequences and otherwise estimated from the labels before
-    and after (`motion.estimate_velocities`), and NaN where it is unknown.
+    and after (`motion.estimate_velocities`), and NaN where it is unknown. "speed_mps" is
+    the speed over ground, which only simulated sequences have.
 
     Attributes:
         header: Frame numbers of all sensors and the time stamp.
@@ -329,9 +330,9 @@ def read(index: Index, keys: Iterable[Key]) -> tuple[list[Frame], Summary]:
         summary.counts["frames left out by weather"] = len(keys) - len(kept)
         keys = kept
     files = _read_label_files(index, keys, summary)
-    velocities = _velocities(index, files, summary)
+    motions = _read_motions(index, files, summary)
     frames = [
-        _make_frame(index, key, file, velocities[key], sequences[key[0]], summary)
+        _make_frame(index, key, file, motions[key], sequences[key[0]], summary)
         for key, file in files.items()
     ]
     return frames, summary
@@ -435,10 +436,10 @@ def _read_label_files(
     return files
 
 
-def _velocities(
+def _read_motions(
     index: Index, files: Mapping[Key, LabelFile], summary: Summary
-) -> dict[Key, Float[np.ndarray, "N 2"]]:
-    """Returns the velocities of the labels of every file in m/s, see `Frame`."""
+) -> dict[Key, Float[np.ndarray, "N 3"]]:
+    """Returns `motion.Motion` of the labels of every file, NaN where it is unknown."""
     # An estimate needs the labels before and after, which may be of another split. Their
     # problems are reported where their own split is read.
     every = list(index.label_paths)
@@ -446,24 +447,28 @@ def _velocities(
     positions = {position + step for position in read for step in range(-2, 3)}
     near = [key for position, key in enumerate(every) if position in positions]
     velocities = motion.estimate_velocities(_read_label_files(index, near, Summary()))
+    motions = {
+        key: np.pad(velocities[key], ((0, 0), (0, 1)), constant_values=np.nan)
+        for key in files
+    }
     for number, keys in itertools.groupby(files, key=lambda key: key[0]):
         folder = index.sequences.get(number, folders.NO_FOLDER)
         path = folder.find("info_motion", "objects.csv")
-        table = _read_or_report(motion.read_velocities, path, "motion", summary)
+        table = _read_or_report(motion.read_motion, path, "motion", summary)
         if table is None:
             continue
         for key in keys:
             names = [(key[1], label.cls, label.track_id) for label in files[key].labels]
-            found = [table.get(name, (np.nan, np.nan)) for name in names]
-            velocities[key] = np.array(found).reshape(-1, 2)
-    return velocities
+            found = [table.get(name, (np.nan,) * 3) for name in names]
+            motions[key] = np.array(found).reshape(-1, 3)
+    return motions
 
 
 def _make_frame(
     index: Index,
     key: Key,
     file: LabelFile,
-    velocity_mps: Float[np.ndarray, "N 2"],
+    motion_mps: Float[np.ndarray, "N 3"],
     sequence: _Sequence,
     summary: Summary,
 ) -> Frame:
@@ -500,7 +505,8 @@ def _make_frame(
         classes=np.array([label.cls for label in file.labels], np.str_),
         columns={
             "track_id": np.array([label.track_id for label in file.labels], np.int64),
-            "velocity_mps": velocity_mps,
+            "velocity_mps": motion_mps[:, :2],
+            "speed_mps": motion_mps[:, 2],
             "visibility": np.array([x.visibility for x in file.labels], np.str_),
         },
         tesseract_path=tesseract,

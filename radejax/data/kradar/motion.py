@@ -17,7 +17,7 @@ from radejax.core.files import PathLike, read_text
 from radejax.core.structures import frame_key
 from radejax.data.kradar.labels import Key, Label, LabelFile
 
-OBJECT_HEADER = "frame,class,track_id,vx_mps,vy_mps"
+OBJECT_HEADER = "frame,class,track_id,vx_mps,vy_mps,speed_mps"
 """First line of `info_motion/objects.csv`; see docs/file_formats.md."""
 
 EGO_HEADER = "frame,timestamp_s,x_m,y_m,heading_rad,speed_mps,yaw_rate_radps"
@@ -30,11 +30,15 @@ MAX_GAP_S = 0.5
 """Longest time between two labels of a track from which a velocity is estimated."""
 
 
-def read_velocities(path: PathLike) -> dict[tuple[str, str, int], tuple[float, float]]:
+Motion = tuple[float, float, float]
+"""x and y of the velocity relative to the radar, and speed over ground, in m/s."""
+
+
+def read_motion(path: PathLike) -> dict[tuple[str, str, int], Motion]:
     """Reads `info_motion/objects.csv` of a sequence.
 
     Returns:
-        x and y of the velocity in m/s, by name of the frame, class and track id.
+        Motion by name of the frame, class and track id.
 
     Raises:
         DataError: The file is malformed.
@@ -44,8 +48,8 @@ def read_velocities(path: PathLike) -> dict[tuple[str, str, int], tuple[float, f
         if header != OBJECT_HEADER:
             raise DataError(f"{path}:1: {header[:80]!r}, expected {OBJECT_HEADER!r}")
         return {
-            (frame_key(name), cls, int(track_id)): (float(vx_mps), float(vy_mps))
-            for name, cls, track_id, vx_mps, vy_mps in (x.split(",") for x in lines)
+            (frame_key(name), cls, int(track_id)): (float(vx), float(vy), float(speed))
+            for name, cls, track_id, vx, vy, speed in (x.split(",") for x in lines)
         }
 
 

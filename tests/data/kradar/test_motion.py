@@ -64,9 +64,11 @@ def test_velocities_of_the_file_are_used_instead(tmp_path):
     write_labels(tmp_path, [sedan(10, 0, 7), sedan(20, 0, 8)], [sedan(11, 0, 7)])
     write_labels(tmp_path, [sedan(10, 0, 7)], [sedan(11, 0, 7)], sequence=2)
     path = tmp_path / "1/info_motion/objects.csv"
-    text = f"{motion.OBJECT_HEADER}\n{NAMES[0]},Sedan,7,1.25,-0.5\n"
+    text = f"{motion.OBJECT_HEADER}\n{NAMES[0]},Sedan,7,1.25,-0.5,3.0\n"
     files.write_text(path, text)
-    assert motion.read_velocities(path) == {(NAMES[0], "Sedan", 7): (1.25, -0.5)}
+    assert motion.read_motion(path) == {(NAMES[0], "Sedan", 7): (1.25, -0.5, 3.0)}
+    speeds = [frame.columns["speed_mps"].tolist() for frame in KRadar(tmp_path)]
+    assert str(speeds) == "[[3.0, nan], [nan], [nan], [nan]]"
     found = [frame.columns["velocity_mps"] for frame in KRadar(tmp_path)]
     np.testing.assert_allclose(found[0], [[1.25, -0.5], [np.nan, np.nan]])
     np.testing.assert_allclose(found[1], [[np.nan, np.nan]])
@@ -81,7 +83,7 @@ def test_velocities_of_the_file_are_used_instead(tmp_path):
             "frame,class\n00004_00001,Sedan\n",
             "expected 'frame,class,track_id,vx_mps,vy_m",
         ),
-        (motion.OBJECT_HEADER + "\na,b,1,x,0\n", "convert string to float"),
+        (motion.OBJECT_HEADER + "\na,b,1,x,0,0\n", "convert string to float"),
     ],
 )
 def test_a_malformed_file_is_reported(tmp_path, text, message):
