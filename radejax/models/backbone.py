@@ -8,17 +8,15 @@ References:
 from __future__ import annotations
 
 import functools
-from typing import Literal
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
+from radejax.core.options import find_part
 from radejax.models import layers
 from radejax.models.layers import ConvGNSiLU, DoubleConvResidual, Features, Map
-
-CBAMKind = Literal["official", "paper", "off"]
 
 REDUCTION = 16
 """Channels per hidden unit of the channel attention's network."""
@@ -64,22 +62,30 @@ class SpatialAttention(layers.Layer):
         return nn.sigmoid(conv(jnp.stack(pooled, -1)))
 
 
-class CBAM(layers.Layer):
-    """Channel attention followed by spatial attention, in a skip connection.
+class SkipAttention(layers.Layer):
+    """Base class of the attention in a skip connection, which keeps shape and width.
 
     Attributes:
-        kind: "paper" applies both attentions only. "official", the block of the released
-            code, has a `ConvGNSiLU` before them, adds the output of this convolution to
-            theirs, and ends with another `ConvGNSiLU`.
-        num_groups: Groups of the normalizations of the official block.
+        num_groups: Groups of its normalizations.
     """
 
-    kind: CBAMKind
     num_groups: int
+
+
+class CBAM(SkipAttention):
+    """Channel attention followed by spatial attention.
+
+    Attributes:
+        is_official: Whether it is the block of the released code, which has a `ConvGNSiLU`
+            before the attentions, adds the output of this convolution to theirs, and ends
+            with another `ConvGNSiLU`. The paper's applies both attentions only.
+    """
+
+    is_official: bool = True
 
     @nn.compact
     def __call__(self, x: Map) -> Map:
-        is_official = self.kind == "official"
+        is_official = self.is_official
         block = functools.partial(
             ConvGNSiLU, x.shape[-1], self.num_groups, dtype=self.dtype
         )
@@ -90,6 +96,20 @@ class CBAM(layers.Layer):
         if is_official:
             y = block(name="end")(y + x)
         return y
+
+
+class PaperCBAM(CBAM):
+    """The CBAM of the paper."""
+
+    is_official: bool = False
+
+
+CBAMS: dict[str, type[SkipAttention]] = {
+    "official": CBAM,
+    "paper": PaperCBAM,
+    "off": SkipAttention,
+}
+"""Attentions of the skip connections by their name in `config.model.cbam`."""
 
 
 class InputStem(layers.Layer):
@@ -135,22 +155,24 @@ class Backbone(layers.Part):
         doppler_bins: Number of Doppler channels of the input, used by `InputStem` only.
         widths: Channels of the encoder levels, finest first.
         decoder_width: Channels of the last decoder stage.
-        cbam: Kind of the `CBAM` in the skip connections; "off" for skips without attention.
+        cbam: Kind of the `CBAM` in the skip connections, or module:Class of another
+            `SkipAttention`; "off" for skips without attention.
         input_stem: Whether to use `InputStem` instead of one 3x3 convolution.
     """
 
     doppler_bins: int
     widths: tuple[int, ...] = (128, 256, 512)
     decoder_width: int = 128
-    cbam: CBAMKind = "official"
+    cbam: str = "official"
     input_stem: bool = False
 
     @nn.compact
     def __call__(self, x: Features) -> Features:
         double = nn.remat(DoubleConvResidual) if self.remat else DoubleConvResidual
         block = functools.partial(double, num_groups=self.num_groups, dtype=self.dtype)
-        attend = nn.remat(CBAM) if self.remat else CBAM
-        cbam = functools.partial(attend, self.cbam, self.num_groups, dtype=self.dtype)
+        part = find_part(self.cbam, "config.model.cbam", CBAMS)
+        attend = nn.remat(part) if self.remat else part
+        cbam = functools.partial(attend, self.num_groups, dtype=self.dtype)
         if self.input_stem:
             stem = functools.partial(InputStem, dtype=self.dtype, name="stem")
             x = stem(self.widths[0], self.doppler_bins, self.num_groups)(x)

@@ -16,7 +16,7 @@ from radejax.core.errors import require
 from radejax.core.options import BelowOne, Options, Positive, Size, find_part
 from radejax.core.structures import BOX_FIELDS, CLASSES, Array
 from radejax.geometry.radar_grid import RadarGrid, is_uniform, values_at
-from radejax.models.backbone import BACKBONES, Backbone, CBAMKind
+from radejax.models.backbone import BACKBONES, CBAMS, Backbone, SkipAttention
 from radejax.models.heads import HEADS, NECKS, Head, Neck
 from radejax.models.image import STRIDE
 
@@ -53,9 +53,9 @@ class RadeNetOptions(Options, section="config.model"):
     """Channels of the last decoder stage, neck and heads."""
     num_groups: Size = 32
     """Groups of every group normalization; must divide every width."""
-    cbam: CBAMKind = "official"
+    cbam: str = "official"
     """Attention on the skip connections: official (the released block), paper (attention
-    only), off."""
+    only), off or module:Class."""
     input_stem: bool = False
     """Separate convolutions for Doppler and elevation channels at the input."""
     backbone: str = "unet"
@@ -94,6 +94,7 @@ class RadeNetOptions(Options, section="config.model"):
     @pydantic.model_validator(mode="after")
     def _check_radenet(self) -> Self:
         find_part(self.backbone, "config.model.backbone", BACKBONES, Backbone)
+        find_part(self.cbam, "config.model.cbam", CBAMS, SkipAttention)
         find_part(self.neck, "config.model.neck", NECKS, Neck)
         find_part(self.heads, "config.model.heads", HEADS, Head)
         least = "above 0 if config.model.doppler_bins is 0"

@@ -58,7 +58,7 @@ def test_frames_may_be_named_as_in_the_files_of_a_report():
     np.testing.assert_array_equal(aps(*by_key, protocol="all_point"), expected)
     found = aps(*by_key, protocol="all_point", frames=table)
     np.testing.assert_array_equal(found, expected)
-    with pytest.raises(DataError, match=r"predictions: row 0: frame '1/3'"):
+    with pytest.raises(DataError, match=r"predictions: row 0: frame '1/00003'"):
         aps(by_key[0], {**HIT, "frame": np.array(["1/3"])}, frames=table)
 
 

@@ -2,9 +2,12 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
-from radejax.models.backbone import Backbone, InputStem
+from radejax.core.errors import UserError
+from radejax.models.backbone import Backbone, InputStem, SkipAttention
+from radejax.models.options import RadeNetOptions
 
 from .. import small_models as small
 
@@ -21,6 +24,29 @@ def test_any_number_of_levels(widths):
         for i in range(len(widths))
     ]
     assert set(names) <= set(variables["params"])
+
+
+class Double(SkipAttention):
+    """An attention that is no attention."""
+
+    def __call__(self, x):
+        return 2 * x
+
+
+def test_skips_have_the_attention_of_the_config():
+    x = np.random.default_rng(0).normal(size=(1, 8, 8, 3)).astype(np.float32)
+    own = f"{__name__}:Double"
+    found = {}
+    for cbam in ("off", own):
+        backbone = Backbone(3, (8,), decoder_width=8, num_groups=4, cbam=cbam)
+        variables = small.drawn(backbone, x)
+        assert "cbam_1" not in variables["params"]
+        found[cbam] = backbone.apply(variables, x)
+    assert np.abs(found["off"] - found[own]).max() > 0.1
+    with pytest.raises(
+        UserError, match=r"cbam is None, expected 'official', 'paper', "
+    ):
+        RadeNetOptions(cbam=None)
 
 
 @pytest.mark.parametrize(("doppler_bins", "there"), [(0, "elevation"), (3, "doppler")])

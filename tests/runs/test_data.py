@@ -246,7 +246,9 @@ def test_a_run_is_evaluated_on_its_part_or_on_all_of_other_folders(
     ):
         _, found = data_of_run(saved, changes)
         assert {frame.sequence for frame in found.frames} == expected
-    saved.grid = RadarGrid.reduced(num_doppler=16, num_range=8, num_elevation=9)
+    saved.grid = RadarGrid.reduced(
+        num_doppler=16, num_range=8, num_elevation=9, num_azimuth=8, max_range_m=30.0
+    )
     with caplog.at_level("WARNING", "radejax"):
         data_of_run(saved)
     assert "while the model was trained with 16 x 8 x 9" in caplog.text

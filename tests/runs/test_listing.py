@@ -19,7 +19,7 @@ def _write(folder: pathlib.Path, config: Config, minutes: list[float]) -> pathli
 
 
 def _report(folder: pathlib.Path, ap: float) -> None:
-    names = [f"mean/all/map_{space}_iou30/p/roi=narrow" for space in ("bev", "3d")]
+    names = [f"mean/all/ap_{space}_iou30/p/roi=narrow" for space in ("bev", "3d")]
     rows = [{"name": name, "ap": x} for name, x in zip(names, (99.0, ap), strict=True)]
     content = {"ap": rows, "options": {"protocols": ["p"]}, "split": "test"}
     (folder / "evaluation").mkdir()
@@ -63,5 +63,5 @@ def test_runs_of_different_metrics_have_a_column(tmp_path: pathlib.Path) -> None
     bev = Config().replace(train={"best_metric": "map_bev_iou30"})
     _report(_write(tmp_path / "b", bev, [1.0]), 2.0)
     table = CliRunner().invoke(runs, [str(tmp_path)]).output
-    assert "99.00  map_bev_iou30/p/roi=narrow" in " ".join(table.split(" "))
+    assert "99.00  map_bev_iou30/p/roi=narrow" in table
     assert "Metric" in table
