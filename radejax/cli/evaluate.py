@@ -236,12 +236,7 @@ def compare(
     if figures and out is not None:
         from radejax.runs.figures import draw_compared
 
-        if not draw_compared(runs, pathlib.Path(out), source, settings, figures):
-            click.echo(
-                "no scenes are drawn: there are no radar data of the compared frames; give "
-                "--data ROOT, or runs that `radejax evaluate` has evaluated",
-                err=True,
-            )
+        draw_compared(runs, pathlib.Path(out), source, settings, figures)
     entry.echo_result(as_json, rows, text.rstrip("\n"))
 
 

@@ -53,41 +53,30 @@ def write_html(
         scenes: Figures of frames in descending order of importance. Those for which the
             file has no space are counted in it.
     """
-    shown = {name: _data_url(figure) for name, figure in curves.items()}
-    space = MAX_BYTES - sum(map(len, shown.values()))
+    images = {name: _data_url(figure) for name, figure in curves.items()}
+    space = MAX_BYTES - sum(map(len, images.values()))
     pictures = []
     num_left_out = 0
     for scene in scenes:
-        picture = _data_url(scene.figure)
-        space -= len(picture)
-        if space < 0:
+        image = _data_url(scene.figure)
+        if len(image) > space:
             num_left_out += 1
-        else:
-            pictures.append((scene.title, scene.tags, picture))
-    choices: dict[str, dict[str, None]] = {}
-    for _, tags, _ in pictures:
-        for kind, values in tags.items():
-            choices.setdefault(kind, {}).update(dict.fromkeys(values))
-    environment = jinja2.Environment(
+            continue
+        space -= len(image)
+        pictures.append((scene.title, scene.tags, image))
+    template = jinja2.Template(
+        files.read_text(_TEMPLATE),
         autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
     )
-    template = environment.from_string(files.read_text(_TEMPLATE))
-    content = template.render(
-        metrics=metrics,
-        tables=tables,
-        curves=shown,
-        pictures=pictures,
-        choices=choices,
-        num_left_out=num_left_out,
-    )
-    files.write_text(path, content)
+    content: JsonObject = {"metrics": metrics, "tables": tables, "curves": images}
+    content |= {"pictures": pictures, "num_left_out": num_left_out}
+    files.write_text(path, template.render(content))
 
 
 def _data_url(figure: Figure) -> str:
     """Returns a figure as the URL of an image that the page contains."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="webp", dpi=100, pil_kwargs={"quality": 70})
+    figure.savefig(buffer, format="webp", dpi=100, pil_kwargs={"quality": 80})
     return f"data:image/webp;base64,{base64.b64encode(buffer.getvalue()).decode()}"

@@ -249,22 +249,13 @@ def _draw_curves(
                 protocol, spaces=space, weights=mask, **settings
             ):
                 curve = (result.recall, result.precision) if result.is_defined else None
-                lines[curve_label(result.cls, result.ap, result.num_gt)] = curve
+                terms = f"AP {result.ap:.1f}, {result.num_gt:,} objects"
+                lines[f"{result.cls}: {terms}"] = curve
         title = f"{protocol}, {space.upper()}, IoU {iou:g}{suffix}"
         name = f"precision_recall_{space}_iou{100 * iou:.4g}"
         figures[name] = draw_precision_recall(panels, title)
         save_figure(figures[name], folder / f"{name}.{options.figures}")
     return figures
-
-
-def curve_label(name: str, ap: float, num_gt: int) -> str:
-    """Returns the label of a precision-recall curve with its AP and number of objects.
-
-    Examples:
-        >>> curve_label("Sedan", 61.25, 1843)
-        'Sedan: AP 61.2, 1,843 objects'
-    """
-    return f"{name}: AP {ap:.1f}, {num_gt:,} objects"
 
 
 def _mistake_counts(data: EvaluationSet, iou: float) -> list[analysis.Entry]:

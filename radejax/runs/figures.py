@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import pathlib
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, TypeVar
@@ -41,6 +42,8 @@ from radejax.visualize.draw import draw_samples, draw_scenes
 from radejax.visualize.style import Matches, Scene, save_figure
 
 T = TypeVar("T")
+
+_log = logging.getLogger(__name__)
 
 
 def frame_scene(
@@ -163,11 +166,12 @@ def draw_compared(
     source: Source,
     options: ReportOptions,
     ending: str,
-) -> int:
+) -> None:
     """Draw a frame of each weather with the detections of several runs side by side.
 
     It is the evaluated frame with the most objects, and the detections are those above the
-    operating score. Of a run with several seeds, the first one is drawn.
+    operating score. Of a run with several seeds, the first one is drawn. If there are no
+    radar data of the frames, a warning is logged.
 
     Args:
         paths: Runs, reports or predictions as for `compare_files`.
@@ -175,21 +179,21 @@ def draw_compared(
         source: Source of the ground truth. Its data replace those of the runs.
         options: Settings of the comparison.
         ending: Format of the figures, such as "pdf".
-
-    Returns:
-        The number of figures, which is 0 if there are no radar data of these frames.
     """
     folders = [next(iter(report_folders(path).values())) for path in paths]
-    made_from = [folder / "source.json" for folder in folders]
-    if source.data:
-        given = {name: getattr(source, name) for name in ("labels", "label_version")}
-        data_options = DataOptions(roots=source.data, **given)
-    elif there := [path for path in made_from if path.is_file()]:
-        stored = files.read_object(there[0])
-        fields = stored.keys() & DataOptions.model_fields.keys()
-        data_options = DataOptions(**{name: stored[name] for name in fields})
-    else:
-        return 0
+    made_from = [x for folder in folders for x in folder.glob("source.json")]
+    fields: JsonObject = {"roots": source.data, **dict(source)}
+    if not source.data:
+        fields = files.read_object(made_from[0]) if made_from else {}
+    data_options = DataOptions(
+        **{name: x for name, x in fields.items() if name in DataOptions.model_fields}
+    )
+    if not data_options.roots:
+        _log.warning(
+            "no scenes are drawn: there are no radar data of the compared frames; give "
+            "--data ROOT, or runs that `radejax evaluate` has evaluated"
+        )
+        return
     reader = find_reader(data_options.format)
     dataset = reader.from_options(data_options, options.classes)
     records = data_options.records and open_projections(data_options.records)
@@ -201,8 +205,7 @@ def draw_compared(
         runs[name] = found.take(found.score > OPERATING_SCORE)
     ids = {key: i for key, i in ids_by_name(table).items() if key in frames}
     evaluated = [frames[key] for key in ids]
-    fullest = fullest_of_weathers(evaluated)
-    for weather, index in fullest.items():
+    for weather, index in fullest_of_weathers(evaluated).items():
         frame = evaluated[index]
         if records:
             grid, projection = records.grid, decode(records[frame.key])
@@ -223,7 +226,6 @@ def draw_compared(
             for name, found in runs.items()
         ]
         save_figure(draw_scenes(scenes), out_dir / f"scenes_{weather}.{ending}")
-    return len(fullest)
 
 
 def spread(values: Sequence[T], count: int) -> list[T]:

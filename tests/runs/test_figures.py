@@ -139,7 +139,10 @@ def test_scenes_show_which_boxes_match(root: pathlib.Path) -> None:
 
 
 def test_compared_runs_are_drawn_side_by_side(
-    root: pathlib.Path, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+    root: pathlib.Path,
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     frames = KRadar([root])
     rows = [
@@ -183,4 +186,4 @@ def test_compared_runs_are_drawn_side_by_side(
     words[words.index("--data") : words.index("--data") + 2] = ["--ground-truth", truth]
     done = runner.invoke(main, list(map(str, words)))
     assert done.exit_code == 0, done.output
-    assert "no scenes are drawn" in done.stderr
+    assert "no scenes are drawn" in caplog.text
