@@ -11,6 +11,7 @@ import os
 import pathlib
 import re
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures.process import BrokenProcessPool
@@ -89,6 +90,8 @@ def process_pool(
 ) -> Iterator[Submit]:
     """Runs worker processes during a block and yields a function to submit work.
 
+    In the processes, JAX uses CPUs only.
+
     Results must be at most a few hundred bytes long. The pool reads all results from one
     pipe, and if a worker is killed while it writes one, the pool waits forever for the
     rest. Writes of less than 4 KiB are atomic and cannot be cut off. Workers should
@@ -148,6 +151,10 @@ def _submit(
 
 def _start(start: Callable[..., object] | None, *arguments: object) -> None:
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    # The accelerator is the parent's, which has reserved its memory.
+    os.environ["JAX_PLATFORMS"] = "cpu"
+    if "jax" in sys.modules:  # imported with the main module
+        sys.modules["jax"].config.update("jax_platforms", "cpu")
     if start is not None:
         start(*arguments)
 

@@ -196,6 +196,20 @@ def test_files_of_all_layouts_are_read(
         )
 
 
+def test_the_page_is_run_on_a_file(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = pathlib.Path(__file__).resolve().parents[2] / "docs" / "adc.md"
+    (code,) = re.findall(r"^```python\n(.*?)^```", page.read_text("utf-8"), re.M | re.S)
+    monkeypatch.chdir(tmp_path)
+    words = np.random.default_rng(0).integers(-9, 9, 128 * 2 * 4 * 128 * 2)
+    words.astype("<i2").tofile("adc_data.bin")
+    names: dict[str, np.ndarray] = {}
+    exec(code, names)
+    assert names["projection"].shape == (128, 48, 128)
+    assert np.isfinite(names["projection"]).all()
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ from jaxtyping import Complex, Float, Inexact, UInt32
 
 from radejax.core.structures import Array
 from radejax.data.adc import FmcwRadar
-from radejax.simulation.radar.tensor import Scatterers
+from radejax.simulation.radar.tensor import Scatterers, white_noise
 
 
 @functools.partial(jax.jit, static_argnames="radar")
@@ -24,7 +25,8 @@ def simulate_adc(
 ) -> Inexact[jax.Array, "D T Q N"]:
     """Simulates the ADC samples of one radar frame. The function is jitted.
 
-    A scatterer keeps its range bin during the frame. Its signal is scaled so that its peak in
+    A scatterer keeps its range bin during the frame. Those beyond the ADC's rate are left out,
+    as by an ideal filter. Its signal is scaled so that its peak in
     the tensor has the power that it has in `tensor.simulate`.
 
     Args:
@@ -52,16 +54,18 @@ def simulate_adc(
     in_time = _phases(chirps / period_mps, scatterers.velocity_mps)  # [D T, S]
     on_array = _phases(antennas, *toward)  # [T Q, S]
     gain = np.prod([window.sum() for window in radar.windows()])
-    amplitude = lax.complex(*scatterers.amplitude.T) / gain
+    span_m = grid.range_step_m * num_samples / (1 if radar.is_complex else 2)
+    is_passed = scatterers.range_m < span_m
+    amplitude = lax.complex(*scatterers.amplitude.T) * is_passed / gain
     in_time = in_time.reshape(num_doppler, num_tx, 1, -1)
     spread = in_time * on_array.reshape(1, num_tx, num_rx, -1)
     of_range = (in_range * amplitude[None]).T
     signal = jnp.matmul(spread, of_range, precision=lax.Precision.HIGHEST)
-    shape = (2, num_tx, num_rx, num_samples, num_doppler)
-    white = jax.random.normal(jax.random.wrap_key_data(jnp.asarray(key)), shape)
+    shape = (num_tx, num_rx, num_samples, num_doppler, 2)
+    white = white_noise(math.prod(shape), key, jnp.uint32(0)).reshape(shape)
     missing = num_samples - grid.num_range
     power = jnp.fft.ifftshift(jnp.pad(noise_power, ((0, missing), (0, 0))), axes=1)
-    spectrum = jnp.sqrt(power / 2)[None, None] * lax.complex(*white)
+    spectrum = jnp.sqrt(power)[None, None] * lax.complex(white[..., 0], white[..., 1])
     noise = jnp.fft.ifft2(spectrum, norm="ortho")  # [T, Q, N, D]
     signal += jnp.moveaxis(noise, -1, 0)
     return signal if radar.is_complex else 2 * signal.real

@@ -300,7 +300,7 @@ def simulate(
             [azimuth[:, index].T * amplitude[:, i : i + 1] for i in (0, 1)], axis=1
         )  # [K, 2 N]
         received = _product(left.reshape(-1, num_kept), right)
-        white = _white_noise(received.size, key, row_idx)
+        white = white_noise(received.size, key, row_idx)
         if state is not None:
             white = _correlate(white, state.range_side, key, row_idx)
         received += _noise(noise, white, window).reshape(received.shape)
@@ -425,12 +425,12 @@ def _correlate(
     The noise of the rows before and after it is generated again.
     """
     one = jnp.uint32(1)
-    before = _white_noise(white.size, key, row_idx - one)
-    after = _white_noise(white.size, key, row_idx + one)
+    before = white_noise(white.size, key, row_idx - one)
+    after = white_noise(white.size, key, row_idx + one)
     return (white + side * (before + after)) * lax.rsqrt(1.0 + 2.0 * side**2)
 
 
-def _white_noise(count: int, key: Key, row_idx: UInt32[jax.Array, ""]) -> White:
+def white_noise(count: int, key: Key, row_idx: UInt32[jax.Array, ""]) -> White:
     """Generates independent Gaussian numbers with a mean square of 1/2.
 
     Adjacent numbers are the real and imaginary part of one complex number. It is computed
