@@ -112,7 +112,7 @@ def get_config() -> Config:
     """Returns the config of `own_radar.py` for this recording."""
     return radar_config().replace(
         classes=CLASSES,
-        model={"doppler_bins": GRID.num_doppler, "input_center": 0.08},
+        model={"doppler_bins": GRID.num_doppler, "input_center": 0.09},
         data={"format": "own_adc:AdcRecordings"},
     )
 
@@ -165,7 +165,7 @@ def to_counts(samples: np.ndarray) -> np.ndarray:
 @click.command()
 @click.argument("root", type=click.Path(path_type=pathlib.Path))
 @click.option("--workdir", default="runs/own_adc", show_default=True)
-@click.option("--drives", default=150, show_default=True, help="Drives to simulate.")
+@click.option("--drives", default=100, show_default=True, help="Drives to simulate.")
 @click.option("--epochs", help="Epochs. Default: that of the config.", type=int)
 def main(root, workdir, drives, epochs):
     """Train on the recordings in ROOT, which are simulated if they are missing."""

@@ -24,7 +24,7 @@ from radejax.config import Config
 from radejax.core.archives import read_npy
 from radejax.core.errors import DataError, require
 from radejax.data.dataset import LabelledFrame, LabelledFrames
-from radejax.data.projection import find_problem, to_log_scale
+from radejax.data.projection import linear_power, to_log_scale
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.options import RadeNetOptions
 from radejax.simulation.config import SimulationOptions
@@ -52,12 +52,8 @@ class OwnFrame(LabelledFrame):
 
     def read_projection(self, grid: RadarGrid) -> np.ndarray:
         """Returns the normalized logarithm of the power, with one channel per Doppler bin."""
-        power = read_npy(self.radar_path).astype(np.float32)
-        with np.errstate(invalid="ignore"):  # the logarithm of negative values
-            projection = to_log_scale(power)
-        if problem := find_problem(projection.max(axis=0), float(power.min())):
-            raise DataError(f"{self.radar_path} is not linear power: {problem}")
-        return projection
+        power = linear_power(read_npy(self.radar_path), "power", self.radar_path)
+        return to_log_scale(power)
 
 
 class OwnRadar(LabelledFrames):

@@ -168,7 +168,8 @@ class RadarGrid(ArrayValues):
                 raise UserError(f"{name} must be {kind}, got {first:g} before {then:g}")
         if not self.num_elevation + self.num_doppler:
             raise UserError(
-                "elevation_rad and doppler_mps are both empty, expected at least one bin"
+                "elevation_rad and doppler_mps are both empty, expected at least one bin: "
+                "give a radar of ranges and azimuths one Doppler bin, [0.0]"
             )
         for name in ("fov_range_m", "fov_azimuth_rad"):
             value = getattr(self, name)
@@ -454,9 +455,9 @@ class RadarGrid(ArrayValues):
     def in_field_of_view(
         self, x_m: Real[ArrayT, "*#bins"], y_m: Real[ArrayT, "*#bins"]
     ) -> Bool[ArrayT, "*bins"]:
-        """Returns True for positions in front of the radar within its azimuth and range."""
+        """Returns True for positions within the azimuth and range of the field of view."""
         xp, (x_m, y_m) = as_floats(x_m, y_m)
-        is_ahead = (xp.abs(xp.arctan2(y_m, x_m)) <= self.fov_azimuth_rad) & (x_m >= 0)
+        is_ahead = xp.abs(xp.arctan2(y_m, x_m)) <= self.fov_azimuth_rad
         is_near = xp.sqrt(x_m * x_m + y_m * y_m) <= self.fov_range_m
         is_inside: ArrayT = is_ahead & is_near
         return is_inside

@@ -187,7 +187,16 @@ def _draw_polar(ax: Axes, scene: Scene, *, show_labels: bool) -> None:
     ax.set_xlim(horizontal.min(), horizontal.max())
     ax.set_ylim(max(vertical[0], 0.0), vertical[-1])
     ax.set(xlabel="azimuth, right positive [deg]", ylabel="range [m]")
-    _draw_over(ax, scene, to_polar, show_labels=show_labels)
+    _draw_over(ax, scene, _outlines_in_polar, show_labels=show_labels)
+
+
+def _outlines_in_polar(
+    points: Float[np.ndarray, "*lines points 2"],
+) -> Float[np.ndarray, "*lines points 2"]:
+    """Convert outlines, which continue beyond 180 degrees instead of crossing the map."""
+    polar = to_polar(points)
+    polar[..., 0] = np.unwrap(polar[..., 0], period=360.0)
+    return polar
 
 
 def draw_frame(scene: Scene) -> Figure:
@@ -321,8 +330,9 @@ def _extent_m(grid: RadarGrid, roi: Sequence[float] | None) -> Extent:
     """Return the extent of the region and its surroundings, or of the field of view."""
     far = bin_edges(grid.range_m)[-1]
     side = far * np.sin(min(grid.fov_azimuth_rad, np.pi / 2))
+    behind = min(far * np.cos(grid.fov_azimuth_rad), -_BEHIND_M)
     if roi is None:
-        return -_BEHIND_M, far, -side, side
+        return behind, far, -side, side
     _, x1, y0, y1 = roi[:4]
     far = min(far, 1.08 * x1)
     # Narrow regions are widened to an aspect ratio of about 3:4 to be readable.

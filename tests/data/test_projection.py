@@ -1,3 +1,5 @@
+from typing import Any
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -7,12 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from radejax.core.errors import UserError
+from radejax.core.errors import DataError, UserError
 from radejax.core.structures import to_float
 from radejax.data.projection import (
     ENCODINGS,
     decode,
     encode,
+    linear_power,
     project_jax,
     project_tensor,
     to_log_scale,
@@ -155,3 +158,82 @@ def test_device_and_host_decode_alike(encoding):
     found = jax.jit(to_float)(jnp.asarray(stored))
     assert found.dtype == jnp.float32
     chex.assert_trees_all_close(found, decode(stored), rtol=1e-6, atol=0)
+
+
+def _image(kind: str) -> np.ndarray:
+    """One range-azimuth image of a single look in a unit."""
+    power = np.random.default_rng(0).exponential(1e5, (64, 50, 2))
+    power[20:24, 10:14] *= 1e4
+    return {
+        "power": power,
+        "averaged_power": power.mean(-1),
+        "amplitude": np.sqrt(power),
+        "db": 10 * np.log10(power),
+        "steps": np.rint(20 * np.log10(power)).astype(np.uint8),
+        "negative db": 10 * np.log10(power) - 100,
+    }[kind]
+
+
+@pytest.mark.parametrize(
+    ("kind", "unit", "step"),
+    [
+        ("power", "power", 0.0),
+        ("averaged_power", "averaged_power", 0.0),
+        ("amplitude", "amplitude", 0.0),
+        ("db", "db", 0.0),
+        ("steps", "db", 0.5),
+    ],
+)
+def test_units_are_converted_to_power(kind: str, unit: Any, step: float) -> None:
+    power = linear_power(_image(kind), unit, "a.npy", db_per_step=step)
+    expected = _image("averaged_power" if kind == "averaged_power" else "power")
+    assert power.dtype == np.float32
+    np.testing.assert_allclose(power, expected, rtol=0.07 if step else 1e-4)
+
+
+@pytest.mark.parametrize(
+    ("kind", "unit", "message"),
+    [
+        (
+            "amplitude",
+            "power",
+            r"noise rises by [34]\.\d dB .* as if values were 'amplitude'",
+        ),
+        (
+            "power",
+            "amplitude",
+            r"noise rises by 1[56]\.\d dB .* as if values were 'power'",
+        ),
+        ("db", "power", "all values are between 1 and 300, as in decibels"),
+        ("negative db", "power", "some values are negative, infinite or NaN"),
+        ("power", "db", "some values are negative, infinite or NaN"),
+        (
+            "steps",
+            "power",
+            "all values are integers below 256, as raw counts: give db_per_step",
+        ),
+        (
+            "steps",
+            "db",
+            "all values are integers below 256, as raw counts: give db_per_step",
+        ),
+    ],
+)
+def test_values_of_another_unit_are_refused(kind: str, unit: Any, message: str) -> None:
+    with pytest.raises(DataError, match=f"^a.npy, read as '{unit}': {message}"):
+        linear_power(_image(kind), unit, "a.npy")
+
+
+def test_ranges_may_be_another_axis() -> None:
+    values = _image("amplitude").swapaxes(0, 1)
+    far = (
+        values * np.geomspace(1e3, 1, 64)[None, :, None]
+    )  # noise that differs in range
+    with pytest.raises(DataError, match=r"noise rises by [34]\.\d dB"):
+        linear_power(far, "power", "a.npy", range_axis=1)
+
+
+@pytest.mark.wrong_types
+def test_unknown_units_are_named() -> None:
+    with pytest.raises(UserError, match="unit is 'watts', expected power or averaged"):
+        linear_power(_image("power"), "watts", "a.npy")

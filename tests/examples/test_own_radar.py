@@ -68,7 +68,8 @@ def test_boxes_are_in_the_radar_frame_and_power_in_decibels(
     ("change", "message"),
     [
         (lambda power: 10 * np.log10(power + 2), "values are between 1 and 300, as in"),
-        (lambda power: power - 1e7, "not linear power: some values are negative"),
+        (lambda power: power - 1e7, "as 'power': some values are negative"),
+        (np.sqrt, "as if values were 'amplitude'"),
         (lambda power: power[:, :40], r"shape \(64, 40, 16\), not \(64, 48, 16\)"),
     ],
 )

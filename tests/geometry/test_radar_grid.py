@@ -144,6 +144,17 @@ def test_bad_axes_are_rejected(name, value, message):
         dataclasses.replace(KRADAR, **{name: value})
 
 
+def test_a_field_of_view_may_be_all_around():
+    azimuth = np.linspace(-np.pi, np.pi, 8, endpoint=False)
+    fov = {"fov_range_m": 50.0, "fov_azimuth_rad": np.pi}
+    whole = dataclasses.replace(KRADAR, azimuth_rad=azimuth, **fov)
+    x = np.array([10.0, -10.0, -10.0, -60.0])
+    y = np.array([0.0, 0.0, -3.0, 0.0])
+    assert whole.in_field_of_view(x, y).tolist() == [True, True, True, False]
+    assert whole.nearest_bin(-10.0, 0.01)[1] == 0
+    assert not KRADAR.in_field_of_view(-10.0, 0.0)
+
+
 @pytest.mark.wrong_types
 def test_grids_without_channels_and_unknown_mappings_are_rejected():
     with pytest.raises(

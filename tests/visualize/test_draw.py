@@ -53,6 +53,22 @@ def test_box_is_drawn_on_its_echo(range_idx, azimuth_idx):
         np.testing.assert_allclose(tile, axes.transData.transform(point), atol=1.0)
 
 
+def test_a_scan_of_360_degrees_is_drawn_whole():
+    grid = dataclasses.replace(
+        GRID,
+        azimuth_rad=np.linspace(-np.pi, np.pi, 36, endpoint=False),
+        fov_azimuth_rad=np.pi,
+    )
+    truth = Boxes.one_frame([-15.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0], ["Sedan"])
+    projection = np.zeros(grid.projection_shape, np.float32)
+    drawn = Scene(projection, grid, ground_truth=truth)
+    bev, polar = draw.draw_frame(drawn).axes
+    assert bev.get_ylim()[0] == pytest.approx(-bev.get_ylim()[1])
+    lines = [c for c in polar.collections if isinstance(c, LineCollection)]
+    widths = [np.ptp(p.vertices[:, 0]) for c in lines for p in c.get_paths()]
+    assert max(widths) < 20.0  # degrees, although the box is on both sides of 180
+
+
 def test_bev_shows_boxes_headings_region_and_legend():
     truth = Boxes.one_frame([10.0, 3.0, 0.0, 4.0, 2.0, 1.5, np.pi / 2], ["Sedan"])
     found = Boxes.one_frame([20.0, -3.0, 0, 4, 2, 1.5, 0], ["Bus or Truck"], [0.875])

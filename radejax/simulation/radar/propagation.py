@@ -121,7 +121,7 @@ def noise_profile(
         float32 linear power.
     """
     law = WEATHERS[weather]
-    width = 2.4 / parameters.azimuth_elements
+    width = parameters.scan_beamwidth_rad or 2.4 / parameters.azimuth_elements
     beam = width * (2.4 / parameters.elevation_elements)
     distance = np.maximum(grid.range_m, 1.0)
     volume = distance**2 * beam * grid.range_widths_m

@@ -98,6 +98,10 @@ class RadarParameters(Options, section="config.simulation.radar"):
     azimuth_elements: Elements = 48.0
     """Number of elements of the virtual array in azimuth, at a spacing of half a
     wavelength."""
+    scan_beamwidth_rad: Annotated[float, Ge(0), Le(0.5)] = 0.0
+    """Half-power width of the beam of a single antenna that scans the azimuths by rotation,
+    instead of an array in azimuth; 0 for an array. `pattern_exponent` is that of the whole
+    rotation, so 0 for echoes all around."""
     elevation_elements: Elements = 16.0
     """Number of elements of the virtual array in elevation, at the same spacing."""
     array_pedestal: Fraction = 0.2
@@ -239,6 +243,15 @@ def range_response(
     return window_response(offset, pedestal)
 
 
+def beam_response(
+    azimuth_rad: PerTarget, grid: RadarGrid, beamwidth_rad: float
+) -> Float[jax.Array, "A S"]:
+    """Computes two-way amplitudes of a rotating antenna with a Gaussian beam."""
+    axis = grid.azimuth_rad.astype(np.float32)[:, None]
+    offset = jnp.mod(axis - azimuth_rad[None] + jnp.pi, 2 * jnp.pi) - jnp.pi
+    return jnp.exp(-4 * np.log(2) * jnp.square(offset / beamwidth_rad))
+
+
 @functools.partial(jax.jit, static_argnames=("grid", "parameters", "output"))
 def simulate(
     scatterers: Scatterers,
@@ -274,7 +287,11 @@ def simulate(
     m = parameters.elevation_elements
     n = parameters.azimuth_elements
     elevation_basis = array_basis(elevation_rad, m, pedestal)
-    azimuth_basis = array_basis(grid.azimuth_rad, n, pedestal)
+    scan_rad = parameters.scan_beamwidth_rad
+    if scan_rad:  # every azimuth is measured alone, as by an element of its own
+        azimuth_basis = np.eye(grid.num_azimuth, dtype=np.float32)
+    else:
+        azimuth_basis = array_basis(grid.azimuth_rad, n, pedestal)
     up: Phases = None
     across: Phases = None
     of_range: Pedestal = 0.0
@@ -284,7 +301,11 @@ def simulate(
         azimuth_basis = azimuth_basis * state.beam_gain[:, None]
         of_range = state.range_pedestal
     elevation = array_signal(scatterers.elevation_rad, m, pedestal, up)  # [M, S]
-    azimuth = array_signal(scatterers.azimuth_rad, n, pedestal, across)  # [N, S]
+    azimuth = (
+        beam_response(scatterers.azimuth_rad, grid, scan_rad)
+        if scan_rad
+        else array_signal(scatterers.azimuth_rad, n, pedestal, across)
+    )  # [N, S]
     window = parameters.doppler_pedestal
     doppler = doppler_response(scatterers.velocity_mps, grid, window)  # [D, S]
     in_range = range_response(scatterers.range_m, grid, of_range)  # [R, S]

@@ -281,3 +281,29 @@ class TestOtherSensors:
         noise = propagation.noise_profile("fog", grid, PARAMETERS, np.zeros(2))
         assert noise.shape == (16, 1)
         assert (noise > 10.0 ** (PARAMETERS.noise_db / 10)).all()
+
+
+def test_a_scanning_antenna_sees_all_around_with_its_beam():
+    """The noise of azimuths is independent, and the beam does not widen off boresight."""
+    grid = RadarGrid(
+        range_m=GRID.range_m,
+        azimuth_rad=np.linspace(-np.pi, np.pi, 360, endpoint=False),
+        elevation_rad=np.array([]),
+        doppler_mps=np.array([0.0]),
+        fov_range_m=31.0,
+        fov_azimuth_rad=np.pi,
+    )
+    width = np.deg2rad(4.0)
+    scanning = PARAMETERS.replace(scan_beamwidth_rad=width)
+    options = {"grid": grid, "parameters": scanning, "noise": np.zeros((32, 1), "f4")}
+    for azimuth in np.deg2rad([-180.0, 0.0, 115.0]):
+        power = tesseract(points(10.0, azimuth), **options)[0, 10, 0]
+        peak = int(np.abs(grid.azimuth_rad - azimuth).argmin())
+        assert power.argmax() == peak
+        halves = power[[peak - 2, (peak + 2) % 360]] / power.max()
+        np.testing.assert_allclose(halves, 0.25, rtol=0.1)  # on the way there and back
+        assert power[(peak + 90) % 360] < 1e-9
+    options["noise"] = np.ones((32, 1), "f4")
+    noise = tesseract(points(10.0, amplitude=0.0), **options)[0, :, 0]
+    assert noise.mean() == pytest.approx(1.0, rel=0.05)
+    assert abs(np.corrcoef(noise[:, :-1].ravel(), noise[:, 1:].ravel())[0, 1]) < 0.05
