@@ -22,12 +22,12 @@ MAX_BYTES = 9_000_000
 _TEMPLATE = pathlib.Path(__file__).with_name("report.html")
 
 
-class Picture(NamedTuple):
+class SceneFigure(NamedTuple):
     """Figure of one frame in a report.
 
     Attributes:
         title: Sequence, frame and mistakes.
-        tags: Values by which the page selects pictures, by what they are, such as "weather".
+        tags: Values by which the page selects figures, by what they are, such as "weather".
         figure: The figure.
     """
 
@@ -41,7 +41,7 @@ def write_html(
     metrics: JsonObject,
     tables: Sequence[object],
     curves: Mapping[str, Figure],
-    scenes: Iterable[Picture],
+    scenes: Iterable[SceneFigure],
 ) -> None:
     """Writes the page, of less than 10 MB, with all tables and figures inside.
 
@@ -55,7 +55,7 @@ def write_html(
     """
     images = {name: _data_url(figure) for name, figure in curves.items()}
     space = MAX_BYTES - sum(map(len, images.values()))
-    pictures = []
+    figures = []
     num_left_out = 0
     for scene in scenes:
         image = _data_url(scene.figure)
@@ -63,7 +63,7 @@ def write_html(
             num_left_out += 1
             continue
         space -= len(image)
-        pictures.append((scene.title, scene.tags, image))
+        figures.append((scene.title, scene.tags, image))
     template = jinja2.Template(
         files.read_text(_TEMPLATE),
         autoescape=True,
@@ -71,7 +71,7 @@ def write_html(
         lstrip_blocks=True,
     )
     content: JsonObject = {"metrics": metrics, "tables": tables, "curves": images}
-    content |= {"pictures": pictures, "num_left_out": num_left_out}
+    content |= {"figures": figures, "num_left_out": num_left_out}
     files.write_text(path, template.render(content))
 
 

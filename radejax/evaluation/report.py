@@ -37,7 +37,7 @@ from radejax.data.kradar.conditions import WEATHERS
 from radejax.evaluation import analysis, protocols
 from radejax.evaluation.boxes import AnyBoxes, Columns, roi_name, write_boxes
 from radejax.evaluation.evaluation_set import EvaluationSet, Result
-from radejax.evaluation.html import Picture, write_html
+from radejax.evaluation.html import SceneFigure, write_html
 from radejax.evaluation.kitti import write_kitti
 from radejax.evaluation.results import (
     ReportOptions,
@@ -82,7 +82,7 @@ def write_report(
     run: str = "radejax",
     left_out: Mapping[str, int] | None = None,
     warnings: Sequence[str] = (),
-    draw_scenes: Callable[[EvaluationSet, pathlib.Path], Iterable[Picture]]
+    draw_scenes: Callable[[EvaluationSet, pathlib.Path], Iterable[SceneFigure]]
     | None = None,
 ) -> Report:
     """Evaluates predictions in the given protocols and `all_point`, and writes the report.

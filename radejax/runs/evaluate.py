@@ -36,7 +36,7 @@ from radejax.evaluation.analysis import (
 )
 from radejax.evaluation.boxes import roi_bounds, roi_name, tables_from_frames
 from radejax.evaluation.evaluation_set import EvaluationSet, Result
-from radejax.evaluation.html import Picture
+from radejax.evaluation.html import SceneFigure
 from radejax.evaluation.report import STALE, Report, write_report
 from radejax.evaluation.results import (
     ReportOptions,
@@ -257,7 +257,7 @@ class Evaluation:
 
     def _draw_scenes(
         self, predictions: Boxes, data: EvaluationSet, folder: pathlib.Path
-    ) -> Iterator[Picture]:
+    ) -> Iterator[SceneFigure]:
         """Draw frames, write figures of the usual and the worst ones, and yield all.
 
         With visualizations, there are also frames of every class, weather and kind of
@@ -293,7 +293,7 @@ class Evaluation:
             }
             text = ", ".join(f"{kind}: {count}" for kind, count in made.items())
             title = f"{name}, score > {OPERATING_SCORE:g}: {text or 'no mistakes'}"
-            yield Picture(title, tags, figure)
+            yield SceneFigure(title, tags, figure)
 
     def _write_figures(
         self, predictions: Boxes, workdir: pathlib.Path, folder: pathlib.Path

@@ -37,7 +37,7 @@ def scenes():
         figure = new_figure(6, 3)
         noise = np.random.default_rng(0).random((60, 60))
         figure.add_subplot().imshow(noise)
-        yield page.Picture(f"in {weather}", {"weather": [weather]}, figure)
+        yield page.SceneFigure(f"in {weather}", {"weather": [weather]}, figure)
 
 
 @pytest.fixture(scope="module")
