@@ -10,6 +10,7 @@ from radejax.cli.detect import detect, export
 from radejax.cli.evaluate import compare, evaluate, runs, score
 from radejax.cli.figures import demo, overlay, view
 from radejax.cli.train import train
+from radejax.core.version import __version__
 
 _COMMANDS = (
     demo,
@@ -32,6 +33,6 @@ _COMMANDS = (
 
 
 @click.group(commands=_COMMANDS, context_settings=entry.SETTINGS)
-@click.version_option(package_name="radejax")
+@click.version_option(__version__)
 def main() -> None:
     """3D object detection in 4D radar tensors: data, training, figures."""

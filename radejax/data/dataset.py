@@ -187,8 +187,10 @@ class LabelledFrames(Sequence[_F]):
             the same files; records of another version are not used. None if the reader
             never changes.
         has_label_versions: Whether `config.data.label_version` applies to the format.
+        license: License of the data, which exported models state.
     """
 
+    license = "not stated by the reader"
     release: str | None = None
     reader_version: str | None = ""
     has_label_versions = False

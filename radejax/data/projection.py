@@ -16,17 +16,20 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Real
+from jaxtyping import Bool, Float, Real
 
 from radejax.core.errors import DataError, UserError, require
+from radejax.core.structures import to_float
+from radejax.geometry.boxes import ArrayT, array_module
 
 POWER_FLOOR = 1e-10
 LOG_OFFSET_DB = 1.2
 LOG_SCALE_DB = 184.3
 """A level is (10 log10(power + POWER_FLOOR) + LOG_OFFSET_DB) / LOG_SCALE_DB."""
 
-MAX_LEVEL = 100.0
-"""Bound on the absolute value of a level; any power in float64 gives -0.54 to 17."""
+MIN_LEVEL = -0.54
+MAX_LEVEL = 17.0
+"""Bounds on a level; any power in float64 is between them."""
 
 MAX_ZERO_SHARE = 0.05
 """Largest fraction of exact zeros, which noise never gives, in data of a radar."""
@@ -41,7 +44,9 @@ _NOISE_RISES_DB = {
 
 _MAX_DECIBELS = 300.0
 _DECIBEL_LEVEL = (10 * math.log10(_MAX_DECIBELS) + LOG_OFFSET_DB) / LOG_SCALE_DB
+_UNIT_LEVEL = LOG_OFFSET_DB / LOG_SCALE_DB
 _LOWEST_LEVEL = (10 * math.log10(2 * POWER_FLOOR) + LOG_OFFSET_DB) / LOG_SCALE_DB
+_SAME_LEVEL = 1e-6  # rounding of a level
 
 
 def project_tensor(
@@ -219,27 +224,52 @@ def linear_power(
     return power
 
 
-def find_problem(
-    beams: Float[np.ndarray, "..."], lowest_power: float = 0.0
-) -> str | None:
-    """Describes why values cannot come from linear power; returns None if they can.
+PROBLEMS = (
+    "some values are negative, infinite or NaN",
+    f"more than {MAX_ZERO_SHARE:.0%} of the beams have a power of exactly 0 at every range",
+    "all values are the same",
+    f"all values are between 1 and {_MAX_DECIBELS:g}, as in decibels",
+)
+"""Reasons why values cannot be linear power, in the order of `find_problems`."""
+
+
+def find_problems(
+    beams: Float[ArrayT, "*B _ _"], lowest: Float[ArrayT, "*B"]
+) -> tuple[Bool[ArrayT, "*B"], ...]:
+    """Finds frames whose values cannot come from linear power.
 
     A tensor is taken to be in decibels if all its cells are above 1 and at most 300: in
     linear power, noise has a wider range, with cells below 1.
 
     Args:
-        beams: Levels, as in a projection, of the strongest cell of every elevation and
-            azimuth.
+        beams: Levels, as in a projection, of the strongest cell of every beam: for every
+            elevation or channel, and azimuth. NumPy arrays, or JAX arrays in a program.
+        lowest: Level of the weakest cell, or of that of a large part of the frame. NaN if
+            any value of the frame is no level.
+
+    Returns:
+        For each of `PROBLEMS`, a mask that is True for the frames that have it.
+    """
+    highest = beams.max((-2, -1))
+    is_level = (lowest >= MIN_LEVEL) & (beams <= MAX_LEVEL).all((-2, -1))
+    is_empty = (beams < _LOWEST_LEVEL).mean((-2, -1)) > MAX_ZERO_SHARE
+    is_constant = highest <= lowest + _SAME_LEVEL
+    is_decibels = (lowest > _UNIT_LEVEL) & (highest <= _DECIBEL_LEVEL)
+    return ~is_level, is_empty, is_constant, is_decibels
+
+
+def find_problem(beams: Float[np.ndarray, "_ _"], lowest_power: float) -> str | None:
+    """Describes why values cannot come from linear power; returns None if they can.
+
+    Args:
+        beams: See `find_problems`.
         lowest_power: Power of the weakest cell of the tensor, or of a large part of it.
     """
-    if not (lowest_power >= 0 and (np.abs(beams) <= MAX_LEVEL).all()):  # also if NaN
-        return "some values are negative, infinite or NaN"
-    share = np.mean(beams < _LOWEST_LEVEL)
-    if share > MAX_ZERO_SHARE:
-        return f"{share:.0%} of the beams have a power of exactly 0 at every range"
-    if lowest_power > 1 and beams.max() <= _DECIBEL_LEVEL:
-        return f"all values are between 1 and {_MAX_DECIBELS:g}, as in decibels"
-    return None
+    lowest = np.array([np.nan])
+    if lowest_power >= 0:
+        lowest = to_log_scale(np.array([lowest_power]))
+    found = find_problems(beams[None], lowest)
+    return next((text for text, x in zip(PROBLEMS, found, strict=True) if x[0]), None)
 
 
 @jax.jit
@@ -254,8 +284,35 @@ def project_jax(
     over_elevation = jnp.moveaxis(tesseract.max(axis=-2), -3, -1)  # [..., R, A, D]
     over_doppler = tesseract.max(axis=-4).swapaxes(-1, -2)  # [..., R, A, E]
     power = jnp.concatenate([over_elevation, over_doppler], axis=-1)
+    return _levels(power)
+
+
+def _levels(power: Real[jax.Array, "*cells"]) -> Float[jax.Array, "*cells"]:
     level = jnp.log10(power.astype(jnp.float32) + POWER_FLOOR)
     return level * (10.0 / LOG_SCALE_DB) + LOG_OFFSET_DB / LOG_SCALE_DB
+
+
+def find_invalid(
+    frames: Real[jax.Array, "*B _ _ _"] | Real[jax.Array, "*B D R E A"],
+    *,
+    are_tensors: bool,
+) -> tuple[Bool[jax.Array, "*B"], ...]:
+    """Finds frames with `PROBLEMS` in JAX; detectors and exported programs use it.
+
+    Args:
+        frames: Projections as they are stored, or tensors of linear power.
+        are_tensors: Whether the frames are tensors.
+    """
+    axes = (-4, -3, -2, -1) if are_tensors else (-3, -2, -1)
+    # On a CPU, the compiler's minimum and maximum can ignore NaN; comparisons do not.
+    if are_tensors:
+        is_valid = (frames >= 0).all(axes)
+        beams, lowest = _levels(frames.max((-4, -3))), _levels(frames.min(axes))
+    else:
+        frames = to_float(frames)
+        is_valid = (frames >= MIN_LEVEL).all(axes)
+        beams, lowest = frames.max(-3), frames.min(axes)
+    return find_problems(beams, jnp.where(is_valid, lowest, jnp.nan))
 
 
 # Storage and network input --------------------------------------------------------
@@ -279,6 +336,25 @@ def stack_frames(
     doppler = [frame[..., :num_doppler] for frame in frames]
     elevation = [frame[..., num_doppler:] for frame in frames]
     return np.concatenate([*doppler, *elevation], axis=-1)
+
+
+def unstack_frames(
+    stacked: Real[ArrayT, "*axes R A C"], num_frames: int, num_doppler: int
+) -> Real[ArrayT, "*axes T R A DE"]:
+    """Separates the frames of `stack_frames`.
+
+    Args:
+        stacked: Input of a network of consecutive frames.
+        num_frames: Number T of frames.
+        num_doppler: Number of Doppler channels of one frame.
+    """
+    xp = array_module(stacked)
+    parts = [
+        part.reshape(*part.shape[:-1], num_frames, part.shape[-1] // num_frames)
+        for part in xp.split(stacked, [num_frames * num_doppler], axis=-1)
+    ]
+    frames: ArrayT = xp.moveaxis(xp.concatenate(parts, -1), -2, -4)
+    return frames
 
 
 ENCODINGS = ("float16", "uint8", "float32")

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import datetime
 import importlib.resources
 import itertools
 import json
@@ -32,7 +33,7 @@ from tabulate import LATEX_ESCAPE_RULES, tabulate
 
 from radejax.core import files
 from radejax.core.files import JsonObject, PathLike
-from radejax.core.version import __version__
+from radejax.core.version import __version__, radejax_commit
 from radejax.data.kradar.conditions import WEATHERS
 from radejax.evaluation import analysis, protocols
 from radejax.evaluation.boxes import AnyBoxes, Columns, roi_name, write_boxes
@@ -80,6 +81,8 @@ def write_report(
     options: ReportOptions,
     *,
     run: str = "radejax",
+    step: int | None = None,
+    data_name: str | None = None,
     left_out: Mapping[str, int] | None = None,
     warnings: Sequence[str] = (),
     draw_scenes: Callable[[EvaluationSet, pathlib.Path], Iterable[SceneFigure]]
@@ -96,6 +99,8 @@ def write_report(
             are written.
         options: Settings of the evaluation.
         run: Name of the run in tables.
+        step: Step of the model; None if it is not known.
+        data_name: Name of the data set; None if it is not known.
         left_out: Counts of what was read and skipped when loading, by reason.
         warnings: Warnings of loading, which are printed in the report.
         draw_scenes: Function from the evaluation set and the folder to the figures of frames
@@ -120,7 +125,11 @@ def write_report(
     splits = np.unique(np.asarray(frames.get("split", [])).astype(str))
     metrics: JsonObject = {
         "run": run,
+        "step": step,
+        "data": data_name,
         "radejax": __version__,
+        "commit": radejax_commit(),
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "options": options.to_dict(),
         "split": splits.item() if splits.size == 1 else None,
         "is_simulated": data.is_simulated,
@@ -165,7 +174,10 @@ def write_report(
             write_kitti(
                 folder / "kitti", *data.evaluated(), frames, score_threshold=least
             )
-        curves = _draw_curves(data, frames, options, folder) if options.plots else {}
+        origin = f"{run}, {describe(metrics)}"
+        curves = {}
+        if options.plots:
+            curves = _draw_curves(data, frames, options, folder, origin)
         scenes = () if draw_scenes is None else draw_scenes(data, folder)
         write_html(folder / "report.html", metrics, built, curves, scenes)
     return Report(text, metrics, results, pathlib.Path(out_dir))
@@ -210,7 +222,8 @@ def _console_text(metrics: JsonObject, tables: RunTables) -> str:
     parts = [
         f"{metrics['run']}: {metrics['num_frames']} {kind}frames, "
         f"{metrics['num_ground_truth']} objects, {metrics['num_predictions']} predictions,"
-        f" score above {options.min_score:g}\n",
+        f" score above {options.min_score:g}",
+        describe(metrics) + "\n",
         *(f"WARNING: {line}\n" for line in metrics["warnings"]),
         rendered(built, is_simulated=metrics["is_simulated"]),
         f"Intervals: {metrics['intervals']}\n",
@@ -220,11 +233,24 @@ def _console_text(metrics: JsonObject, tables: RunTables) -> str:
     return "\n".join(parts) + "\n"
 
 
+def describe(metrics: JsonObject) -> str:
+    """Describes in one line where the numbers of metrics.json come from."""
+    known = {
+        "step": metrics["step"],
+        "data": metrics["data"],
+        "split": metrics["split"],
+    }
+    parts = [f"{name} {value}" for name, value in known.items() if value is not None]
+    parts += [f"radejax {metrics['radejax']}", f"commit {metrics['commit']}"]
+    return ", ".join([*parts, metrics["date"]])
+
+
 def _draw_curves(
     data: EvaluationSet,
     frames: Columns,
     options: ReportOptions,
     folder: pathlib.Path,
+    origin: str,
 ) -> dict[str, Figure]:
     """Draws precision over recall for each weather, one curve per class with objects.
 
@@ -254,7 +280,7 @@ def _draw_curves(
         title = f"{protocol}, {space.upper()}, IoU {iou:g}{suffix}"
         name = f"precision_recall_{space}_iou{100 * iou:.4g}"
         figures[name] = draw_precision_recall(panels, title)
-        save_figure(figures[name], folder / f"{name}.{options.figures}")
+        save_figure(figures[name], folder / f"{name}.{options.figures}", origin)
     return figures
 
 

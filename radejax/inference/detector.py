@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax.typing import VariableDict
 from jax.sharding import NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
-from jaxtyping import Float, PyTree, Real, Shaped
+from jaxtyping import Bool, Float, PyTree, Real, Shaped
 
 from radejax import models
 from radejax.core.errors import require
@@ -43,6 +43,9 @@ _log = logging.getLogger(__name__)
 
 Item = Frames | Batch | tuple[Frames, Images | None, Calibrations | None]
 """Item of `Detector.stream`: frames, or a tuple of frames, image and camera."""
+
+Problems = tuple[Bool[jax.Array, " B"], ...]
+"""Masks of the frames with each of `projection.PROBLEMS`."""
 
 
 def detect(
@@ -105,8 +108,8 @@ class Detector:
         num_radar_only: Number of frames so far that a radar-camera model predicted
             without an image and its calibration. Frames in a `Batch` are not counted.
         num_invalid_frames: Number of frames so far, passed as NumPy arrays, with values
-            that cannot be radar power (NaN, infinity, decibels). Their detections are
-            meaningless.
+            that cannot be radar power (NaN, infinity, negative, constant, decibels). Their
+            detections are meaningless.
 
     Examples:
         >>> detector = Detector.from_workdir("runs/quickstart")  # doctest: +SKIP
@@ -162,7 +165,11 @@ class Detector:
         self._lock = threading.Lock()
         # Every process gets all detections: they are small.
         self._run = jax.jit(run, out_shardings=self.replicated)
-        self._extremes = jax.jit(reading.extremes, out_shardings=self.replicated)
+        self._find_invalid = jax.jit(
+            projection.find_invalid,
+            static_argnames="are_tensors",
+            out_shardings=self.replicated,
+        )
 
     @classmethod
     def from_workdir(
@@ -300,8 +307,7 @@ class Detector:
     def _read_radar(self, frames: Frames, num_frames: int = 1) -> Real[Any, "B ..."]:
         """Read radar data, and compare a frame of the first calls with the training's."""
         radar = self.reader.read_radar(frames, num_frames)
-        # Those of `warmup` are all 0.
-        if self._num_unchecked and isinstance(radar, np.ndarray) and radar.any():
+        if self._num_unchecked and isinstance(radar, np.ndarray):
             if radar.ndim == 5:  # on the host, as compiling takes longer
                 levels = self.grid.measured_channels(project_tensor(radar[0]))
             else:
@@ -319,10 +325,10 @@ class Detector:
         inputs = jax.tree.map(lambda x: self.put(_padded(x, size)), inputs)
         # The check is awaited after the network was started, so that the device is not idle
         # meanwhile.
-        extremes = None if is_checked else self._extremes(inputs.radar)
+        problems = None if is_checked else self._problems(inputs.radar)
         found: Detections = self._run(self.variables, *inputs, settings)
-        if extremes is not None:
-            self._count_invalid(inputs.radar, extremes, count)
+        if problems is not None:
+            self._count_invalid(problems, count)
         if jax.default_backend() == "cpu" and len(self.sharding.device_set) > 1:
             # With several batches in flight, CPU devices that share cores can fail to
             # synchronize.
@@ -331,25 +337,26 @@ class Detector:
             found = jax.tree.map(lambda x: x[:count], found)
         return found.replace(class_names=self.classes)
 
-    def _count_invalid(
-        self, frames: Real[Array, "B ..."], extremes: reading.Extremes, count: int
-    ) -> None:
+    def _problems(self, frames: Real[Array, "B ..."]) -> Problems:
+        found: Problems = self._find_invalid(frames, are_tensors=frames.ndim == 5)
+        return found
+
+    def _count_invalid(self, problems: Problems, count: int) -> None:
         """Count invalid frames among the first `count`, and warn of the first ones."""
-        if frames.dtype == jnp.uint8:
-            return  # every value is a valid level
-        of_frames = jax.tree.map(lambda x: x[:count], jax.device_get(extremes))
-        problems = reading.find_problems(of_frames, are_tensors=frames.ndim == 5)
-        if problems and not self.num_invalid_frames:
+        found = np.array(jax.device_get(problems))[:, :count]  # [problem, frame]
+        num_invalid = int(found.any(axis=0).sum())
+        if num_invalid and not self.num_invalid_frames:
+            first = found[:, found.any(axis=0).argmax()]
             _log.warning(
                 "%d of %d frames are not linear power or its projection: %s. Their "
                 "detections are meaningless; further ones are counted in "
                 "num_invalid_frames",
-                len(problems),
+                num_invalid,
                 count,
-                problems[0],
+                projection.PROBLEMS[first.argmax()],
             )
         with self._lock:
-            self.num_invalid_frames += len(problems)
+            self.num_invalid_frames += num_invalid
 
     # Consecutive frames --------------------------------------------------------------
 
@@ -359,7 +366,7 @@ class Detector:
         """Compute float32 projections of any radar data, and count invalid NumPy arrays."""
         placed = jnp.asarray(radar)
         if isinstance(radar, np.ndarray):
-            self._count_invalid(placed, self._extremes(placed), len(placed))
+            self._count_invalid(self._problems(placed), len(placed))
         if placed.ndim == 5:
             placed = self.grid.measured_channels(project_jax(placed))
         return np.asarray(to_float(placed))
@@ -432,14 +439,18 @@ class Detector:
         Returns:
             The detector itself.
         """
+        made = self
         if isinstance(sample, int):
+            made = self.replace()
+            made._num_unchecked = 0
+            made.num_invalid_frames = 1  # no warning of the frames, which are empty
             count = sample
             steps = (self.num_frames,) if self.num_frames > 1 else ()
             sample = np.zeros((count, *steps, *self.grid.projection_shape), np.float32)
             if models.has_camera(self.model):
                 image, blank = no_images(count, self.model.options.image.size)
                 camera = blank.replace(is_valid=np.ones(count, bool))
-        jax.block_until_ready(self(sample, image, camera))
+        jax.block_until_ready(made(sample, image, camera))
         return self
 
     def detect_function(self) -> Callable[..., Detections]:

@@ -6,13 +6,15 @@ The programs run without radejax. Folders of all formats contain `config.json` a
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import inspect
 import json
 import logging
 import pathlib
+import re
 import warnings
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -26,10 +28,11 @@ from jaxtyping import PyTree
 from radejax import models
 from radejax.core import files
 from radejax.core.errors import UserError, require
+from radejax.core.files import JsonObject
 from radejax.core.structures import to_float
-from radejax.core.version import __version__
+from radejax.core.version import __version__, radejax_commit
 from radejax.data.cameras import no_images
-from radejax.data.projection import project_jax
+from radejax.data.projection import find_invalid, project_jax, unstack_frames
 from radejax.geometry.camera import Camera
 from radejax.inference import exported_loader
 from radejax.inference.detector import Detector
@@ -47,17 +50,24 @@ OPTIONS_FILE = "compile_options.pb"
 INPUTS_FILE = "inputs.json"
 OUTPUTS_FILE = "outputs.json"
 _OF_PROGRAMS = {
-    PROGRAM_FILE,
-    BYTECODE_FILE,
-    OPTIONS_FILE,
-    INPUTS_FILE,
-    OUTPUTS_FILE,
-    "load.py",
-    "detector.onnx",
-    "network.onnx",
+    PROGRAM_FILE: "network, decoding and rotated NMS",
+    BYTECODE_FILE: "the same as bytecode for PJRT",
+    OPTIONS_FILE: "the compile options for PJRT",
+    "detector.onnx": "network, decoding and rotated NMS",
+    "network.onnx": "the network",
+    INPUTS_FILE: "inputs of the program by index; null is any size",
+    OUTPUTS_FILE: "outputs of the program by index",
+    "load.py": "runs the program without radejax",
+}
+_OF_MODELS = {
+    CONFIG_FILE: "config, origin, grid, and checksums of the other files",
+    WEIGHTS_FILE: "weights by name",
 }
 _COMPILE_OPTIONS = bytes.fromhex("1a0420012801")
 """XLA's `CompileOptionsProto` for one replica and one partition."""
+
+_TESTED_JAX = {"smallest": "0.9.2", "exported": "0.10.2"}
+"""Smallest version of JAX that reads what versions up to the second one export."""
 
 
 CHUNK_SIZE = 1024
@@ -66,7 +76,7 @@ CHUNK_SIZE = 1024
 INPUTS = ("projection", "tensor")
 """Radar data with which a program begins: projections, or tensors that it projects."""
 
-RESULTS = ("boxes", "scores", "classes", "is_valid", "num_truncated")
+RESULTS = ("boxes", "scores", "classes", "is_valid", "num_truncated", "num_invalid")
 
 _MODEL_CARD = pathlib.Path(__file__).with_name("model_card.md")
 _LEFT_OUT = (
@@ -99,7 +109,8 @@ def export(
         kind: Format of the folder. All formats contain the weights, the config and a
             model card, and "huggingface" contains only these. "stablehlo" adds the program
             and `load.py`, which needs only jax, flatbuffers and numpy. "onnx" adds the
-            network, and the network with decoding and NMS, for one batch size.
+            network, the network with decoding and NMS, for one batch size, and `load.py`,
+            which needs only onnxruntime and numpy.
         platforms: Platforms of the StableHLO program, from `KNOWN_PLATFORMS`.
         with_backbone: Keep the weights of the image transformer, see `save_model`.
         batch_size: Number of frames per call; None means any number with StableHLO, and 1
@@ -124,9 +135,7 @@ def export(
     shape = _radar_shape(detector, radar_input)
     folder = files.as_path(folder)
     there = {path.name for path in folder.glob("[!.]*")}
-    foreign = (
-        there - _OF_PROGRAMS - {CONFIG_FILE, WEIGHTS_FILE, "README.md", "__pycache__"}
-    )
+    foreign = there - {*_OF_PROGRAMS, *_OF_MODELS, "README.md", "__pycache__"}
     if CONFIG_FILE in there and "format" not in files.read_object(folder / CONFIG_FILE):
         foreign.add(CONFIG_FILE)
     if foreign:
@@ -146,11 +155,14 @@ def export(
             with_backbone=with_backbone,
             half=half,
             programs=programs,
+            jax_versions=_jax_versions() if kind == "stablehlo" else None,
         )
-        if kind == "stablehlo":
+        if programs:
             files.write_text(temporary / "load.py", inspect.getsource(exported_loader))
-        left_out = content["left_out"]
-        files.write_text(temporary / "README.md", _readme(detector, shape, left_out))
+        names = {path.name for path in temporary.iterdir()}
+        card = _readme(detector, shape, kind, content, names)
+        files.write_text(temporary / "README.md", card)
+    left_out: list[str] = content["left_out"]
     num_bytes = sum(p.stat().st_size for p in folder.rglob("*") if p.is_file())
     return num_bytes, left_out
 
@@ -170,24 +182,84 @@ def _radar_shape(detector: Detector, radar_input: str) -> tuple[int, ...]:
     return detector.grid.shape_drea
 
 
-def _readme(detector: Detector, shape: Sequence[int], left_out: Sequence[str]) -> str:
-    """Return the text of the model card."""
+def _jax_versions() -> dict[str, str]:
+    """Return the smallest and largest version of JAX that can read a program.
+
+    Older versions than the tested ones may not know operations that newer ones write. JAX
+    reads what was exported six months before, which is about two minor versions.
+    """
+    exported = jax.__version__.split("+")[0]
+    major, minor, patch = (int(x) for x in re.findall("[0-9]+", exported)[:3])
+    *tested, last = map(int, _TESTED_JAX["exported"].split("."))
+    is_tested = (major, minor, patch) <= (*tested, last)
+    return {
+        "smallest": _TESTED_JAX["smallest"] if is_tested else exported,
+        "exported": exported,
+        "largest": f"{major}.{minor + 1}",
+    }
+
+
+def _readme(
+    detector: Detector,
+    shape: Sequence[int],
+    kind: str,
+    content: JsonObject,
+    names: Iterable[str],
+) -> str:
+    """Return the text of the model card of a folder.
+
+    Args:
+        detector: The detector.
+        shape: Shape of one frame of the input.
+        kind: Format of the folder. Parts of the text are for some formats, "all", or models
+            of several "frames".
+        content: Content of `config.json`.
+        names: Names of the files.
+    """
     radar = "Power of radar tensors" if len(shape) == 4 else "Projections"
     config = detector.saved.config
     if release := config.data.release:
         radar = f"Projections of K-Radar's {release} files"
     simulation = config.simulation
     is_simulated = simulation is not None and simulation.scenes == "procedural"
-    return _MODEL_CARD.read_text().format(
+    every, *parts = re.split(r"<!-- (.*) -->\n", _MODEL_CARD.read_text())
+    pairs = zip(parts[::2], parts[1::2], strict=True)
+    tags = {kind, "all", "frames" if detector.num_frames > 1 else ""}
+    own = [text for names, text in pairs if tags & set(names.split())]
+    use = "`load.py`, or " if "load.py" in names else ""
+    listed = {n: x for n, x in (_OF_MODELS | _OF_PROGRAMS).items() if n in names}
+    return "".join([every, *own]).format(
         name=type(detector.model).__name__,
         classes=", ".join(detector.classes),
+        use=f"{use}`radejax.Detector.from_workdir(folder)`; see docs/deploy.md of radejax",
         input=f"{radar} [B, {', '.join(map(str, shape))}] float32, B frames.",
-        radejax=__version__,
-        jax=jax.__version__,
+        frames=detector.num_frames,
+        jax=content.get("jax"),
         count=config.decode.max_detections,
-        left_out=_LEFT_OUT if left_out else "nothing",
+        left_out=_LEFT_OUT if content["left_out"] else "nothing",
         origin=_SIMULATED if is_simulated else _MEASURED,
+        identity="\n".join(f"| {n} | {x} |" for n, x in _origin(content).items() if x),
+        files="\n".join(f"- `{n}`: {x}" for n, x in listed.items()),
     )
+
+
+def _origin(content: JsonObject) -> dict[str, str]:
+    """Return what identifies a model as text by name, empty where it is not known."""
+    known = content["identity"]
+    metrics = known.get("metrics")
+    lines = {name: known.get(name, "not known") for name in ("run", "step", "date")}
+    lines |= {f"data {n}": x for n, x in known.get("data", {}).items()}
+    lines["trained with"] = ", ".join(
+        f"{name} {x}" for name, x in known.get("versions", {}).items()
+    )
+    lines["trained in clone"] = known.get("commit", "")
+    lines["with radejax of"] = known.get("radejax_commit", "")
+    lines["exported with"] = f"radejax {content['radejax']}, commit {content['commit']}"
+    if not metrics:
+        return lines | {"metrics": "this step was not evaluated on the test split"}
+    place = f"{metrics['num_frames']} frames of the {metrics['split']} split"
+    lines["AP in %"] = f"{place} of {metrics['data']}, {metrics['evaluation']}"
+    return lines | {f"`{name}`": f"{ap:.2f}" for name, ap in metrics["ap"].items()}
 
 
 # Programs ----------------------------------------------------------------------------
@@ -252,6 +324,7 @@ _UNITS = {
     "classes": "index into config.classes, -1 for padding",
     "is_valid": "true for a detection",
     "num_truncated": "number of peaks and boxes that were dropped",
+    "num_invalid": "number of frames that cannot be radar data: no, if 0",
 }
 
 
@@ -274,11 +347,30 @@ def _detect(
     detector: Detector, variables: VariableDict, inputs: PyTree, settings: Settings
 ) -> dict[str, jax.Array]:
     """Run the detector on inputs in the shapes of `_exported`, for both program formats."""
-    projection, *rest = inputs
+    radar, *rest = inputs
     image, camera = (rest[0], Camera(**rest[1])) if rest else (None, None)
     function = detector.detect_function()
-    found = function(variables, projection, image, camera, settings)
-    return {name: getattr(found, name) for name in RESULTS}
+    found = function(variables, radar, image, camera, settings)
+    if are_tensors := radar.ndim == 5:
+        frames = radar[:, None]
+    else:
+        frames = unstack_frames(radar, detector.num_frames, detector.grid.num_doppler)
+    problems = jnp.stack(find_invalid(frames, are_tensors=are_tensors))
+    num_invalid = problems.any(axis=0).sum(axis=-1, dtype=jnp.int32)
+    results = vars(found) | {"num_invalid": num_invalid}
+    return {name: results[name] for name in RESULTS}
+
+
+@contextlib.contextmanager
+def _without_locations() -> Iterator[None]:
+    """Leave source files out of programs, which are then the same on other machines."""
+    name = "jax_traceback_in_locations_limit"
+    limit = getattr(jax.config, name)
+    jax.config.update(name, 0)
+    try:
+        yield
+    finally:
+        jax.config.update(name, limit)
 
 
 def _stablehlo(
@@ -305,7 +397,8 @@ def _stablehlo(
 
     weights = {name: _array(*x.shape) for name, x in flat.items()}
     export_of = jax.export.export(jax.jit(program), platforms=tuple(platforms))
-    exported = export_of(weights, inputs, *_SETTINGS.values())
+    with _without_locations():
+        exported = export_of(weights, inputs, *_SETTINGS.values())
     names = [*sorted(weights), *_names(inputs), *_SETTINGS]
     kept = exported.module_kept_var_idx  # a program has only the inputs that it uses
     used = [(names[i], exported.in_avals[i]) for i in kept]
@@ -318,6 +411,18 @@ def _stablehlo(
         contents[BYTECODE_FILE] = exported.mlir_module_serialized
         contents[OPTIONS_FILE] = _COMPILE_OPTIONS
     return contents
+
+
+def _onnx_metadata(detector: Detector) -> dict[str, object]:
+    """Return what a file tells of its model, as JSON by name."""
+    return {
+        "radejax": __version__,
+        "commit": radejax_commit(),
+        "identity": detector.saved.identity,
+        "classes": detector.classes,
+        "grid": detector.grid.to_dict(),
+        "decode": detector.decode_options.model_dump(mode="json"),
+    }
 
 
 def _onnx_files(
@@ -374,6 +479,8 @@ def _onnx_files(
     ) -> bytes:
         names = {"input_names": list(given), "output_names": list(results)}
         converted = to_onnx(function, list(given.values()), **names)
+        for name, value in _onnx_metadata(detector).items():
+            converted.metadata_props.add(key=name, value=json.dumps(value))
         return bytes(converted.SerializeToString())
 
     every = inputs | _SETTINGS

@@ -1,29 +1,46 @@
 """Detects objects in radar data without radejax: python load.py array.npy [...].
 
-It needs `pip install jax flatbuffers`. README.md describes the arrays, here of one frame.
+It needs `pip install jax flatbuffers`, or `pip install onnxruntime` in a folder with an
+ONNX program. README.md describes the arrays, here of one frame.
 """
 
 import hashlib
 import json
 import pathlib
+import re
 import sys
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
-import jax
-import jax.export
 import numpy as np
 
+FORMAT = "radejax-3"
 FOLDER = pathlib.Path(__file__).resolve().parent
 
+Run = Callable[[Sequence[Any], Sequence[np.ndarray]], dict[str, Any]]
 
-def read_file(path: pathlib.Path, sha256: str) -> bytes:
-    """Reads a file; raises `ValueError` if its SHA-256 differs from the exported file's."""
-    data = path.read_bytes()
-    if hashlib.sha256(data).hexdigest() != sha256:
+
+def read_folder(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """Reads config.json and the files that it lists, of which none may be changed.
+
+    Raises:
+        ValueError: The folder has another format, or a file is corrupted.
+        FileNotFoundError: A file is missing.
+    """
+    config = json.loads((folder / "config.json").read_text())
+    if config.get("format") != FORMAT:
         raise ValueError(
-            f"{path}: corrupted, its sha256 differs from the one in config.json"
+            f"{folder}: format {config.get('format')!r}, and this load.py reads {FORMAT!r}: "
+            "export the model again, or use the load.py of that folder"
         )
-    return data
+    data = {name: (folder / name).read_bytes() for name in config["sha256"]}
+    for name, sha256 in config["sha256"].items():
+        if hashlib.sha256(data[name]).hexdigest() != sha256:
+            raise ValueError(
+                f"{folder / name}: corrupted, its sha256 differs from the one in config.json"
+            )
+    return config, data
 
 
 def read_weights(data: bytes) -> dict[str, np.ndarray]:
@@ -35,34 +52,89 @@ def read_weights(data: bytes) -> dict[str, np.ndarray]:
     return {n: flat[slice(*ends[n])].reshape(v["shape"]) for n, v in header.items()}
 
 
+def check_jax(found: str, versions: Mapping[str, str]) -> None:
+    """Raises `ImportError` for a version of JAX that is too old; warns of a newer one."""
+    numbers = {n: [*map(int, re.findall("[0-9]+", x))] for n, x in versions.items()}
+    number = [*map(int, re.findall("[0-9]+", found)[:3])]
+    text = f"JAX {found}, expected {versions['smallest']} to {versions['largest']}"
+    if number < numbers["smallest"]:
+        raise ImportError(f"{text}: pip install jax=={versions['exported']}")
+    if number[:2] > numbers["largest"]:
+        warnings.warn(f"{text}: if loading fails, export again", stacklevel=3)
+
+
+def stablehlo(config: dict[str, Any], data: dict[str, bytes], device: Any) -> Run:
+    """Returns the program for JAX, with its weights on a device."""
+    import jax
+    import jax.export  # not a part of `import jax`
+
+    check_jax(jax.__version__, config["jax"])
+    run = jax.jit(jax.export.deserialize(bytearray(data["detector.stablehlo"])).call)
+    weights = jax.device_put(read_weights(data["model.safetensors"]), device)
+
+    def call(inputs: Sequence[Any], settings: Sequence[np.ndarray]) -> dict[str, Any]:
+        # On CPU, device_put shares memory with arrays that the caller may overwrite, so
+        # they are copied.
+        own = jax.tree.map(np.array, inputs)
+        found: dict[str, Any] = run(weights, *jax.device_put([own], device), *settings)
+        return found
+
+    return call
+
+
+def onnx(data: dict[str, bytes], session_options: Any) -> Run:
+    """Returns the program for ONNX Runtime."""
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(data["detector.onnx"], session_options)
+    rows = json.loads(data["inputs.json"])
+    names = [output.name for output in session.get_outputs()]
+
+    def call(inputs: Sequence[Any], settings: Sequence[np.ndarray]) -> dict[str, Any]:
+        camera = [part[name] for part in inputs[2:] for name in sorted(part)]
+        arrays = zip(rows, [*inputs[:2], *camera, *settings], strict=True)
+        feed = {row["name"]: np.asarray(x, row["dtype"]) for row, x in arrays}
+        return dict(zip(names, session.run(None, feed), strict=True))
+
+    return call
+
+
 def load(
-    folder: str | pathlib.Path = FOLDER, device: jax.Device | None = None
-) -> Callable[..., dict[str, jax.Array]]:
+    folder: str | pathlib.Path = FOLDER, device: Any = None, session_options: Any = None
+) -> Callable[..., dict[str, Any]]:
     """Loads the detector of an exported folder as a function `detect(projection, ...)`.
 
     The function returns a dictionary of arrays. Its keyword arguments `score_threshold`,
     `nms_iou` and `roi` replace the defaults.
+
+    Args:
+        folder: The folder.
+        device: Device of JAX; its default if None.
+        session_options: `SessionOptions` of ONNX Runtime, such as its number of threads.
     """
     folder = pathlib.Path(folder).expanduser()
-    config = json.loads((folder / "config.json").read_text())
-    data = {name: read_file(folder / name, x) for name, x in config["sha256"].items()}
-    run = jax.jit(jax.export.deserialize(bytearray(data["detector.stablehlo"])).call)
-    weights = jax.device_put(read_weights(data["model.safetensors"]), device)
+    config, data = read_folder(folder)
+    if "detector.onnx" in data:
+        run = onnx(data, session_options)
+    elif "detector.stablehlo" in data:
+        run = stablehlo(config, data, device)
+    else:
+        raise ValueError(f"{folder}: only weights, expected --format stablehlo or onnx")
     decode = config["config"]["decode"]
     defaults = {name: decode[name] for name in ("score_threshold", "nms_iou")}
     defaults["roi"] = decode.get("roi") or [-np.inf, np.inf] * 3
 
-    def detect(*inputs: object, **settings: object) -> dict[str, jax.Array]:
+    def detect(*inputs: object, **settings: object) -> dict[str, Any]:
         if unknown := set(settings) - set(defaults):
             raise TypeError(f"unknown {unknown}, expected {sorted(defaults)}")
-        values = [np.asarray(x, np.float32) for x in {**defaults, **settings}.values()]
-        if not (values[2][::2] < values[2][1::2]).all():  # also if a limit is NaN
+        given = {**defaults, **settings}
+        values = [np.asarray(x, np.float32) for x in given.values()]
+        for name, value in zip(given, values[:2], strict=False):
+            if not 0 <= value <= 1:  # also if it is NaN
+                raise ValueError(f"{name} {value}: expected a number from 0 to 1")
+        if not (values[2][::2] < values[2][1::2]).all():
             raise ValueError(f"roi {values[2]}: expected x0 < x1, y0 < y1, z0 < z1")
-        # On CPU, device_put shares memory with arrays that the caller may overwrite, so
-        # they are copied.
-        own = jax.tree.map(np.array, inputs)
-        found: dict[str, jax.Array] = run(weights, jax.device_put(own, device), *values)
-        return found
+        return run(inputs, values)
 
     return detect
 
@@ -72,6 +144,9 @@ if __name__ == "__main__":
     for path in sys.argv[1:]:
         array = np.load(path)
         levels = np.float32(1 / 255 if array.dtype == np.uint8 else 1)  # of records
-        found = jax.device_get(detect(array.astype(np.float32)[None] * levels))
-        rows = found["is_valid"][0]
-        print(path, found["scores"][0][rows], found["boxes"][0][rows], sep="\n")
+        result = detect(array.astype(np.float32)[None] * levels)
+        found = {name: np.asarray(value)[0] for name, value in result.items()}
+        rows = found["is_valid"]
+        print(path, found["scores"][rows], found["boxes"][rows], sep="\n")
+        if found["num_invalid"]:
+            print("The values are not those of radar data: the boxes are meaningless.")

@@ -26,7 +26,6 @@ from radejax.data.cameras import no_camera, read_left_image
 from radejax.data.kradar import reduced
 from radejax.data.kradar.tesseract import read_frame
 from radejax.data.options import CameraOptions, DataOptions
-from radejax.data.projection import MAX_LEVEL, find_problem, to_log_scale
 from radejax.detection.decode import ROI_LIMITS, DecodeOptions, is_roi
 from radejax.geometry.camera import (
     KRADAR_RADAR_FROM_LIDAR_Z_M,
@@ -359,50 +358,3 @@ def check_settings(
     limits = ROIS.get(roi, ()) if isinstance(roi, str) else tuple(roi)
     require(is_roi(limits), "roi", roi, f"narrow, wide or {ROI_LIMITS}")
     return {**numbers, "roi": limits}
-
-
-# Values that cannot be radar power ---------------------------------------------------
-
-
-class Extremes(NamedTuple):
-    """Extreme values of B frames, by which invalid frames are found.
-
-    Attributes:
-        lowest: Smallest value of each frame, or -inf if it contains NaN or values below
-            the valid ones.
-        beams: Maximum over range (and Doppler) of each frame.
-    """
-
-    lowest: Float[Array, " B"]
-    beams: Real[Array, "B _ _"]
-
-
-def extremes(frames: Real[jax.Array, "B ..."]) -> Extremes:
-    """Compute the extreme values of projections or tensors; may be jitted."""
-    are_tensors = frames.ndim == 5
-    axes = tuple(range(1, frames.ndim))
-    # On a CPU, the compiler's minimum and maximum can ignore NaN; comparisons do not.
-    is_valid = (frames >= (0 if are_tensors else -MAX_LEVEL)).all(axes)
-    lowest = jnp.where(is_valid, frames.min(axes).astype(jnp.float32), -jnp.inf)
-    return Extremes(lowest, frames.max(axis=(1, 2) if are_tensors else 1))
-
-
-def find_problems(of_frames: Extremes, *, are_tensors: bool) -> list[str]:
-    """Describe why frames cannot be linear power or levels of a projection.
-
-    Args:
-        of_frames: Extreme values of the frames on the host.
-        are_tensors: Whether the frames are tensors of linear power.
-
-    Returns:
-        One description for every invalid frame, see `projection.find_problem`.
-    """
-    problems = []
-    for lowest, beams in zip(*of_frames, strict=True):
-        beams = beams.astype(np.float64)
-        if are_tensors:
-            with np.errstate(invalid="ignore"):  # the logarithm of a negative maximum
-                problems.append(find_problem(to_log_scale(beams), float(lowest)))
-        else:
-            problems.append(find_problem(beams, -1.0 if np.isneginf(lowest) else 0.0))
-    return [problem for problem in problems if problem]

@@ -3,7 +3,7 @@
 Runs, exported folders and official PyTorch files are all loaded as a `SavedModel`. An
 exported folder has the files that the Hugging Face Hub expects:
 
-    config.json          the config of the run, the grid, checksums of the other files
+    config.json          the config of the run, its origin, the grid, checksums of the files
     model.safetensors    variables by name, "params/backbone/..."
 
 It contains the weights of DINOv3 only on request, because their license restricts
@@ -29,11 +29,12 @@ from radejax.config import Config
 from radejax.core import files
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import JsonObject, PathLike
-from radejax.core.version import __version__
+from radejax.core.version import __version__, radejax_commit
 from radejax.data.kradar.labels import LABEL_CLASSES
 from radejax.data.options import CameraOptions, DataOptions
 from radejax.detection.decode import DecodeOptions
 from radejax.geometry.radar_grid import RadarGrid
+from radejax.inference.exported_loader import FORMAT
 from radejax.models.dinorade import IMAGE_BACKBONE
 from radejax.models.lifting import OFFICIAL_OFFSET_M
 from radejax.models.options import DinoRadeOptions, RadeNetOptions
@@ -50,7 +51,6 @@ _log = logging.getLogger(__name__)
 
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
-FORMAT = "radejax-2"
 
 FROZEN_BACKBONE = "sha256 of the frozen image backbone"
 """Key of the first 16 digits of the checksum in a checkpoint's description of its run."""
@@ -81,6 +81,8 @@ class SavedModel:
             checkpoint.
         usual_input: Mean and standard deviation of the projections that the model was
             trained on; None if they are not known.
+        identity: Name of the run, step, date, commit, versions, data and metrics, as far as
+            they are known.
     """
 
     config: Config
@@ -89,6 +91,7 @@ class SavedModel:
     step: int | None = None
     run: JsonObject = dataclasses.field(default_factory=dict)
     usual_input: Sequence[float] | None = None
+    identity: JsonObject = dataclasses.field(default_factory=dict)
 
     @property
     def model(self) -> RadeNet:
@@ -191,7 +194,12 @@ def load_torch(
         data=DataOptions(azimuth_mapping="stretched", camera=camera),
         decode=DecodeOptions(threshold_inclusive=False),
     )
-    return SavedModel(config, RadarGrid.kradar(), variables)
+    return SavedModel(
+        config,
+        RadarGrid.kradar(),
+        variables,
+        identity={"run": files.as_path(source).name},
+    )
 
 
 # Exported folders --------------------------------------------------------------------
@@ -204,6 +212,7 @@ def save_model(
     with_backbone: bool = False,
     half: bool = False,
     programs: Mapping[str, bytes] | None = None,
+    jax_versions: Mapping[str, str] | None = None,
 ) -> JsonObject:
     """Write a model to a folder as `config.json` and `model.safetensors`.
 
@@ -214,6 +223,7 @@ def save_model(
         with_backbone: Keep the weights of the image transformer.
         half: Store weights as float16; `load_model` converts them to float32.
         programs: Contents of further files by name.
+        jax_versions: Versions of JAX that a program is for, if there is one.
 
     Returns:
         The content of `config.json`.
@@ -248,6 +258,9 @@ def save_model(
     description = {
         "format": FORMAT,
         "radejax": __version__,
+        "commit": radejax_commit(),
+        "identity": saved.identity,
+        **({"jax": dict(jax_versions)} if jax_versions else {}),
         "config": saved.config.without_data_paths(),
         "grid": saved.grid.to_dict(),
         "input": saved.usual_input,
@@ -265,8 +278,11 @@ def _read_exported(folder: pathlib.Path) -> SavedModel:
     content = files.read_object(path)
     data = weights.read_bytes()
     try:
-        found = content.get("format")
-        require(found == FORMAT, "format", found, repr(FORMAT))
+        if (found := content.get("format")) != FORMAT:
+            raise ValueError(
+                f"format is {found!r}, expected {FORMAT!r}: export the run again with "
+                f"radejax {__version__}"
+            )
         if hashlib.sha256(data).hexdigest() != content["sha256"][WEIGHTS_FILE]:
             raise DataError(
                 f"{weights} is corrupted or of another model: its sha256 differs from "
@@ -277,7 +293,10 @@ def _read_exported(folder: pathlib.Path) -> SavedModel:
         variables = unflatten_dict(arrays, sep="/")
         config = Config(**content["config"])
         grid, usual = RadarGrid.from_dict(content["grid"]), content.get("input")
-        saved = SavedModel(config, grid, variables, usual_input=usual)
+        identity = content["identity"]
+        saved = SavedModel(
+            config, grid, variables, usual_input=usual, identity=identity
+        )
         image_backbone.check_fits(saved.model, variables, weights)
         return saved
     # These are raised for a file that was edited by hand.
@@ -315,14 +334,46 @@ def _read_checkpoint(path: pathlib.Path, step: Step) -> SavedModel:
         state, info, number = checkpoints.restore_variables(chosen)
     trained = state["ema_params"] if state.get("ema_params") else state["params"]
     params = merge_parameters(trained, state.get("frozen") or {})
+    try:
+        config = Config(**info["config"])
+    except UserError as error:
+        version = info["run"].get("versions", {}).get("radejax")
+        raise UserError(
+            f"{folder}: {error}; the run is of radejax {version}, and this is radejax "
+            f"{__version__}: train again, or use that version"
+        ) from None
     return SavedModel(
-        Config(**info["config"]),
+        config,
         RadarGrid.from_dict(info["grid"]),
         {"params": params, **(state.get("model_state") or {})},
         number,
         {**info["same"], **info["run"]},
         info["run"].get("input"),
+        _identity(folder.parent, number, info["run"]),
     )
+
+
+def _identity(workdir: pathlib.Path, step: int, run: JsonObject) -> JsonObject:
+    """Return what identifies a checkpoint, without paths of this machine."""
+    metrics = None
+    for path in sorted(workdir.glob("evaluation*/metrics.json")):
+        found = files.read_object(path)
+        if metrics is None and (found.get("step"), found["split"]) == (step, "test"):
+            first = found["options"]["protocols"][0]
+            aps = {
+                row["name"]: row["ap"]
+                for row in found["ap"]
+                if row["num_gt"]
+                and (row["condition"], row["protocol"]) == ("all", first)
+            }
+            names = ("data", "split", "num_frames")
+            metrics = {"evaluation": path.parent.name, **{n: found[n] for n in names}}
+            metrics["ap"] = aps
+    wanted = ("date", "commit", "radejax_commit", "versions", "data")
+    known = {name: run[name] for name in wanted if name in run}
+    is_seed = workdir.name.startswith("seed")  # of `run_seeds`
+    name = "/".join(workdir.parts[-2:]) if is_seed else workdir.name
+    return {"run": name, "step": step, **known, "metrics": metrics}
 
 
 def _with_backbone(saved: SavedModel, given: PathLike | None) -> SavedModel:

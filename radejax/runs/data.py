@@ -16,7 +16,7 @@ import numpy as np
 from radejax.config import Config, check_bins
 from radejax.core import devices
 from radejax.core.errors import UserError, require
-from radejax.core.files import as_path
+from radejax.core.files import JsonObject, as_path
 from radejax.core.options import find_function
 from radejax.core.structures import Batch
 from radejax.data import cameras, pipeline, records
@@ -62,6 +62,7 @@ class Data:
         camera: Options that define how images and calibrations are used; None for
             radar-only models.
         features: Embedded images, or None.
+        license: License of the data.
 
     Raises:
         UserError: Embeddings are given, but another backbone computed them, the model
@@ -93,10 +94,23 @@ class Data:
             self.features = records.open_embeddings(options.embeddings, image.to_dict())
         frames = find_reader(options.format).from_options(options, self.classes)
         self.frames = frames.with_valid_boxes(self.classes)
+        simulation = config.simulation
+        is_own = simulation is not None and simulation.scenes == "procedural"
+        is_own = is_own and self.frames.is_simulated
+        self.license = "Apache-2.0, that of radejax" if is_own else frames.license
         name = f"radar data in {', '.join(options.roots)}"
         check_release(self.frames.release, options.release, name)
         if self.frames.release is not None and not config.model.doppler_bins:
             self.frames.grid = self.frames.grid.without_doppler()
+
+    def describe(self) -> JsonObject:
+        """Return names, kind and license of the data, without paths of this machine."""
+        return {
+            "name": ", ".join(as_path(root).name for root in self.options.roots),
+            "format": self.options.format,
+            "simulated": self.frames.is_simulated,
+            "license": self.license,
+        }
 
     def preprocess(self) -> None:
         """Write the missing records on the main process while the others wait.

@@ -228,7 +228,10 @@ class Evaluation:
         def write() -> Report:
             with files.swapped_in(place, *_STALE, *STALE) as folder:
                 files.write_json(folder / "source.json", {"step": step, **self._source})
-                draw_scenes = functools.partial(self._draw_scenes, predictions)
+                data_name = self._data.describe()["name"]
+                origin = f"{run or workdir.name}, step {step}, data {data_name}, split "
+                origin += self._split
+                draw_scenes = functools.partial(self._draw_scenes, predictions, origin)
                 report = write_report(
                     self._truth,
                     predictions,
@@ -236,13 +239,15 @@ class Evaluation:
                     folder,
                     self._options,
                     run=run or workdir.name,
+                    step=step,
+                    data_name=data_name,
                     left_out=self._frames.summary().counts,
                     draw_scenes=draw_scenes,
                 )
                 _log.info("step %s, split %s\n%s", step, self._split, report.text)
                 if self._detector.takes_camera:
                     self._write_camera_share(variables, folder / "camera_share.json")
-                self._write_figures(predictions, workdir, folder)
+                self._write_figures(predictions, workdir, folder, origin)
             return dataclasses.replace(report, folder=place)
 
         return devices.main_only(write)
@@ -256,7 +261,11 @@ class Evaluation:
         files.write_json(path, figures.average_shares(shares, grid))
 
     def _draw_scenes(
-        self, predictions: Boxes, data: EvaluationSet, folder: pathlib.Path
+        self,
+        predictions: Boxes,
+        origin: str,
+        data: EvaluationSet,
+        folder: pathlib.Path,
     ) -> Iterator[SceneFigure]:
         """Draw frames, write figures of the usual and the worst ones, and yield all.
 
@@ -279,9 +288,8 @@ class Evaluation:
         for index, (name, figure) in zip(shown, drawn, strict=True):
             for kind, among in (("figures", usual), ("worst_frames", worst)):
                 if index in among:
-                    save_figure(
-                        figure, folder / kind / f"{name}.{self._options.figures}"
-                    )
+                    path = folder / kind / f"{name}.{self._options.figures}"
+                    save_figure(figure, path, origin)
             made = {kind: int(x[index].sum()) for kind, x in counts.items()}
             made = {kind: count for kind, count in made.items() if count}
             is_there = data.gt_count[index] > 0
@@ -296,7 +304,11 @@ class Evaluation:
             yield SceneFigure(title, tags, figure)
 
     def _write_figures(
-        self, predictions: Boxes, workdir: pathlib.Path, folder: pathlib.Path
+        self,
+        predictions: Boxes,
+        workdir: pathlib.Path,
+        folder: pathlib.Path,
+        origin: str,
     ) -> None:
         """Write a figure of all weathers and the loss curves."""
         frames = self._frames
@@ -307,12 +319,12 @@ class Evaluation:
                 self._scene(predictions, i, title=f"{name} ({frames[i].key}){suffix}")
                 for name, i in figures.fullest_of_weathers(frames).items()
             ]
-            save_figure(draw_scenes(scenes), folder / f"scenes.{ending}")
+            save_figure(draw_scenes(scenes), folder / f"scenes.{ending}", origin)
         if (workdir / "metrics.jsonl").exists():
             series = curves.read_metrics(workdir / "metrics.jsonl")
             if losses := [n for n in self._config.loss.weights if n in series]:
                 figure = curves.draw_training(series, losses, workdir.name + suffix)
-                save_figure(figure, folder / f"training.{ending}")
+                save_figure(figure, folder / f"training.{ending}", origin)
 
     def _scene(self, predictions: Boxes, index: int, **fields: Any) -> Scene:
         """Return the scene of a frame with its boxes and image.

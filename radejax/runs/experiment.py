@@ -4,8 +4,8 @@ The workdir of a run contains
 
 config.json      the configuration without the paths of the data, which the checkpoints
                  contain; after the first checkpoint, only its logging and length may change
-run.json         versions, commits, hashes of own parts, command, weights that the training
-                 started from
+run.json         versions, commits, date, data, hashes of own parts, command, weights that the
+                 training started from
 checkpoints/     the newest checkpoints and the best one, by step
 metrics.jsonl    losses by step; tensorboard/ has the same values
 evaluation/      metrics.json, metrics.csv, tables and figures of the last evaluation;
@@ -18,13 +18,12 @@ from __future__ import annotations
 import contextlib
 import csv
 import dataclasses
+import datetime
 import functools
 import hashlib
 import logging
 import pathlib
 import shlex
-import shutil
-import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -44,7 +43,7 @@ from radejax.core.errors import UserError, require
 from radejax.core.files import JsonObject, PathLike
 from radejax.core.options import find_function
 from radejax.core.structures import Batch
-from radejax.core.version import __version__
+from radejax.core.version import __version__, commit, radejax_commit
 from radejax.data.dataset import FrameSequence
 from radejax.data.records import open_embeddings
 from radejax.evaluation.report import Table, number, numbers, write_tables
@@ -146,7 +145,8 @@ def run(
                 ", ".join(data.options.roots),
             )
         info = run_info(folder, init_from, init_partial)
-        info |= {"input": data.usual_input, "parts": own_parts(config)}
+        info |= {"input": data.usual_input, "data": data.describe()}
+        info |= {"parts": own_parts(config)}
         if devices.is_main():
             files.write_json(folder / "run.json", info)
         training_data = TrainingData(
@@ -451,7 +451,7 @@ def run_info(
     init_from: PathLike | None = None,
     init_partial: PathLike | None = None,
 ) -> JsonObject:
-    """Returns versions, commits, device, command and starting weights of a run as plain values.
+    """Returns versions, commits, date, device, command and starting weights of a run.
 
     Args:
         workdir: Workdir of the run.
@@ -467,28 +467,15 @@ def run_info(
         for name, one in given.items()
     }
     versions = {"radejax": __version__, "jax": jax.__version__}
-    package = pathlib.Path(__file__).parents[2]
-    is_checkout = (package / ".git").exists()
     return {
         **start,
         "versions": {**versions, "python": sys.version.split()[0]},
-        "commit": _commit(pathlib.Path.cwd()),
-        "radejax_commit": _commit(package) if is_checkout else None,
+        "commit": commit(pathlib.Path.cwd()),
+        "radejax_commit": radejax_commit(),
+        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "device": str(jax.devices()[0].device_kind),
         "command": shlex.join(sys.argv),
     }
-
-
-def _commit(folder: pathlib.Path) -> str | None:
-    """Returns the git commit of a folder, followed by "-dirty" if tracked files differ.
-
-    The result is None without a commit or without git.
-    """
-    if shutil.which("git") is None:
-        return None
-    command = ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
-    return done.stdout.strip() or None
 
 
 def own_parts(config: Config) -> dict[str, str]:

@@ -28,6 +28,7 @@ from numpy.typing import ArrayLike
 from radejax.core.errors import UserError
 from radejax.core.files import PathLike, as_path, atomic_path
 from radejax.core.structures import Boxes
+from radejax.core.version import __version__, radejax_commit
 from radejax.geometry.boxes import bev_corners
 from radejax.geometry.camera import CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
@@ -387,12 +388,22 @@ def figure_format(path: pathlib.Path) -> str:
     return suffix
 
 
-def save_figure(figure: Figure, path: PathLike) -> pathlib.Path:
+_KEYS = {
+    "png": ("Software", "Description"),
+    "svg": ("Creator", "Description"),
+    "pdf": ("Creator", "Subject"),
+}
+"""Names of the metadata that figure files have."""
+
+
+def save_figure(figure: Figure, path: PathLike, description: str = "") -> pathlib.Path:
     """Write a figure to a file, which is replaced atomically.
 
     Args:
         figure: The figure.
         path: File to write. The suffix determines the format; missing folders are created.
+        description: Origin of the figure for the metadata of the file, which also have the
+            version and commit.
 
     Returns:
         The path of the file.
@@ -402,10 +413,12 @@ def save_figure(figure: Figure, path: PathLike) -> pathlib.Path:
     """
     path = as_path(path)
     suffix = figure_format(path)
+    values = f"radejax {__version__}, commit {radejax_commit()}", description
+    metadata = dict(zip(_KEYS.get(suffix, ()), values, strict=False)) or None
     # Publishers require TrueType fonts; matplotlib embeds Type 3 fonts by default.
     with (
         atomic_path(path) as temporary,
         matplotlib.rc_context({"pdf.fonttype": 42, "ps.fonttype": 42}),
     ):
-        figure.savefig(temporary, format=suffix)
+        figure.savefig(temporary, format=suffix, metadata=metadata)
     return path

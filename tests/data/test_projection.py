@@ -13,12 +13,17 @@ from radejax.core.errors import DataError, UserError
 from radejax.core.structures import to_float
 from radejax.data.projection import (
     ENCODINGS,
+    PROBLEMS,
     decode,
     encode,
+    find_invalid,
+    find_problem,
     linear_power,
     project_jax,
     project_tensor,
+    stack_frames,
     to_log_scale,
+    unstack_frames,
 )
 
 SHAPE = (4, 6, 3, 5)  # D, R, E, A
@@ -237,3 +242,43 @@ def test_ranges_may_be_another_axis() -> None:
 def test_unknown_units_are_named() -> None:
     with pytest.raises(UserError, match="unit is 'watts', expected power or averaged"):
         linear_power(_image("power"), "watts", "a.npy")
+
+
+def test_problems_of_files_and_in_programs_are_the_same():
+    """The number of the problem, for the host, a tensor and its projection."""
+    rng = np.random.default_rng(0)
+    power = 10 ** rng.uniform(-3, 15, SHAPE)
+    negative, one_nan, empty = power.copy(), power.copy(), power.copy()
+    negative[0, 0, 0, 0], one_nan[0, 0, 0, 0] = -1.0, np.nan
+    empty[..., :1] = 0.0
+    decibels = rng.uniform(1.1, 299.0, SHAPE)
+    for number, tensor in (
+        (None, power),
+        (0, negative),
+        (0, one_nan),
+        (1, empty),
+        (2, np.full(SHAPE, 7.0)),
+        (3, decibels),
+    ):
+        tensor = tensor.astype(np.float32)
+        projection = np.asarray(project_jax(tensor))
+        beams = projection[..., SHAPE[0] :].max(axis=0)
+        expected = None if number is None else PROBLEMS[number]
+        assert find_problem(beams, float(tensor[..., 0].min())) == expected
+        forms = [(tensor, True)]
+        if tensor is not negative and number != 0:  # maxima are not the smallest values
+            forms.append((projection, False))
+        for frame, are_tensors in forms:
+            found = find_invalid(jnp.asarray(frame[None]), are_tensors=are_tensors)
+            first = [i for i, mask in enumerate(found) if mask[0]][:1]
+            assert first == ([] if number is None else [number])
+
+
+def test_stacked_frames_are_separated():
+    frames = np.random.default_rng(0).random((3, 2, 6, 5, 7))  # T, B, R, A, D+E
+    stacked = stack_frames(list(frames), 4)
+    found = unstack_frames(stacked, 3, 4)
+    np.testing.assert_array_equal(found, np.moveaxis(frames, 0, 1))
+    for num_doppler in (0, 7):  # a radar without Doppler or elevation
+        found = unstack_frames(stack_frames(list(frames), num_doppler), 3, num_doppler)
+        np.testing.assert_array_equal(found, np.moveaxis(frames, 0, 1))

@@ -184,8 +184,11 @@ def test_invalid_frames_are_counted_and_warned_of_once(
     assert "as in decibels" in text
     levels = 184.3 * projections[:3] - 1.2
     assert count(levels)[0] == 3
-    # Neither stored levels nor arrays on a device are checked.
+    assert count(0 * tesseracts[:3], 0 * projections[:3])[0] == 6
+    # Arrays on a device are not checked, nor are the frames of a warm-up counted.
     assert count((255 * projections[:3]).astype(np.uint8), jnp.asarray(levels))[0] == 0
+    made = detector.replace(batch_sizes=(1,)).warmup()
+    assert (made.num_invalid_frames, caplog.text) == (0, "")
 
 
 def test_input_unlike_that_of_the_training_is_warned_of_once(

@@ -1,8 +1,10 @@
 """Exported folders give the same boxes without this package."""
 
+import dataclasses
 import json
 import os
 import pathlib
+import shutil
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -14,7 +16,8 @@ import pytest
 from jax.extend import backend
 from jaxlib import _jax as jaxlib_client
 
-from radejax import Detector, UserError
+import radejax
+from radejax import DataError, Detector, UserError, load_model
 from radejax.core.structures import MIN_SIZE_M
 from radejax.data.projection import encode
 from radejax.geometry.camera import stack_cameras
@@ -124,12 +127,16 @@ def test_a_program_of_two_frames_takes_the_channels_of_both(tmp_path):
     export.export(detector, tmp_path, platforms=("cpu",))
     rows = json.loads((tmp_path / "inputs.json").read_text())
     assert rows[-4]["shape"] == [None, 16, 14, 10]
-    assert "Projections [B, 16, 14, 10] float32" in (tmp_path / "README.md").read_text()
+    card = (tmp_path / "README.md").read_text()
+    assert "Projections [B, 16, 14, 10] float32" in card
+    assert "channels of all 2 frames, oldest first" in card
     frames = small.projections(2)
     parts = [frames[..., :2], frames[..., 2:]]
     stacked = np.concatenate([part[i] for part in parts for i in (0, 1)], -1)
     detect = exported_loader.load(tmp_path)
     found = {f"{name}_1": x for name, x in detect(stacked[None]).items()}
+    stacked[:, :, 0] = np.nan  # the first frame
+    assert detect(stacked[None])["num_invalid"] == 1
     again = Detector.from_workdir(tmp_path)
     assert again.num_frames == 2
     _check(found, "1", again(frames))
@@ -158,9 +165,10 @@ def test_a_program_of_one_batch_size_and_platform_has_static_shapes(tmp_path):
     assert [list(x.shape) for x in inputs] == [row["shape"] for row in rows]
     found = _run_bytecode(tmp_path, inputs)
     wanted = detector(projection, roi=(-99, 99) * 3)
+    expected = vars(wanted) | {"num_invalid": np.zeros(2)}
     rows = json.loads((tmp_path / "outputs.json").read_text())
     for row, value in zip(rows, found, strict=True):
-        np.testing.assert_allclose(value, getattr(wanted, row["name"]), atol=1e-4)
+        np.testing.assert_allclose(value, expected[row["name"]], atol=1e-4)
         assert [list(value.shape), str(value.dtype)] == [row["shape"], row["dtype"]]
 
 
@@ -196,14 +204,135 @@ def test_a_program_that_begins_with_the_tensor(tmp_path):
         TypeError, match=r"unknown {'iou'}, expected \['nms_iou', 'roi'"
     ):
         exported_loader.load(tmp_path)(small.projections(1), iou=0.5)
+    detect = exported_loader.load(tmp_path)
     for region in ((0, 20, None, None, -9, 9), (20, 0, -5, 5, -9, 9)):
         with pytest.raises(ValueError, match=r"roi .* expected x0 < x1"):
-            exported_loader.load(tmp_path)(small.projections(1), roi=region)
+            detect(small.projections(1), roi=region)
+    for name, value in (("score_threshold", np.nan), ("nms_iou", 1.5)):
+        with pytest.raises(ValueError, match=f"{name} {value}: expected a number from"):
+            detect(small.projections(1), **{name: value})
     _, left_out = export.export(small.detector("camera"), tmp_path, kind="huggingface")
     assert left_out == ["params/image_backbone"]
     assert "DINOv3" in (tmp_path / "README.md").read_text()
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {"README.md", "config.json", "model.safetensors"}
+
+
+def _spoiled(frames, are_tensors):
+    """Frames, of which only those of the first name are radar data."""
+    cases = {"valid": frames}
+    for value in (np.nan, np.inf, -np.inf, -1.0):
+        cases[str(value)] = frames.copy()
+        cases[str(value)][(0, *[1] * (frames.ndim - 1))] = value
+    decibels = 10 * np.log10(frames) if are_tensors else 184.3 * frames - 1.2
+    cases |= {"decibels": decibels.astype(np.float32), "zeros": np.zeros_like(frames)}
+    return cases | {"constant": np.full_like(frames, 0.5)}
+
+
+def _check_invalid(detector, folder, radar_input, kind):
+    """Compare `num_invalid` of a program with what the detector counts."""
+    rng = np.random.default_rng(0)
+    frames = small.projections(1)
+    if are_tensors := radar_input == "tensor":
+        frames = 10 ** rng.uniform(2, 15, (1, *detector.grid.shape_drea))
+        frames = frames.astype(np.float32)
+    options = {"kind": kind, "batch_size": 1, "radar_input": radar_input}
+    export.export(detector, folder, platforms=("cpu",), **options)
+    detect = exported_loader.load(folder)
+    for name, given in _spoiled(frames, are_tensors).items():
+        counting = detector.replace()
+        counting(given)
+        found = np.asarray(detect(given)["num_invalid"]).tolist()
+        assert found == [int(name != "valid")], name
+        assert counting.num_invalid_frames == found[0], name
+
+
+@pytest.mark.parametrize("radar_input", export.INPUTS)
+def test_a_program_tells_of_values_that_are_not_radar_data(radar_input, tmp_path):
+    _check_invalid(small.detector(), tmp_path, radar_input, "stablehlo")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("radar_input", export.INPUTS)
+def test_an_onnx_file_tells_of_them_too(radar_input, tmp_path):
+    pytest.importorskip("jax2onnx")
+    pytest.importorskip("onnxruntime")
+    _check_invalid(small.detector(), tmp_path, radar_input, "onnx")
+
+
+def test_a_folder_is_checked_before_it_runs(tmp_path, monkeypatch):
+    origin = {"run": "a", "step": 7, "commit": "abc", "data": {"license": "free"}}
+    origin["metrics"] = {
+        "evaluation": "evaluation",
+        **{"data": "drives", "split": "test", "num_frames": 3, "ap": {"mean/x": 12.3}},
+    }
+    saved = dataclasses.replace(small.detector().saved, identity=origin)
+    export.export(Detector(saved), tmp_path, platforms=("cpu",))
+    assert load_model(tmp_path).identity == origin
+    card = (tmp_path / "README.md").read_text()
+    for text in (
+        "step | 7",
+        "license | free",
+        "3 frames of the test",
+        "mean/x` | 12.30",
+    ):
+        assert text in card
+    for path in tmp_path.iterdir():
+        assert (f"- `{path.name}`:" in card) == (path.name != "README.md")
+    assert "network.onnx" not in card
+    assert f"radejax {radejax.__version__}, commit " in card
+    config = json.loads((tmp_path / "config.json").read_text())
+    assert config["jax"]["smallest"] == "0.9.2"  # while JAX 0.10.2 is the newest
+    monkeypatch.setattr(jax, "__version__", "0.9.1")
+    text = r"JAX 0\.9\.1, expected 0\.9\.2 to .*: pip install jax==0\."
+    with pytest.raises(ImportError, match=text):
+        exported_loader.load(tmp_path)
+    monkeypatch.setattr(jax, "__version__", "1.0.0.dev3")
+    with pytest.warns(UserWarning, match=r"JAX 1\.0.*if loading fails, export again"):
+        exported_loader.load(tmp_path)
+    assert export._jax_versions()["smallest"] == "1.0.0.dev3"  # not tested
+    for name in config["sha256"]:
+        data = (tmp_path / name).read_bytes()
+        (tmp_path / name).write_bytes(data[:-1] + bytes([data[-1] ^ 1]))
+        with pytest.raises(ValueError, match=f"{name}: corrupted, its sha256 differs"):
+            exported_loader.load(tmp_path)
+        (tmp_path / name).write_bytes(data)
+    (tmp_path / "config.json").write_text(json.dumps({**config, "format": "radejax-2"}))
+    with pytest.raises(ValueError, match=r"format 'radejax-2', .*'radejax-3': export"):
+        exported_loader.load(tmp_path)
+    with pytest.raises(DataError, match=r"format is 'radejax-2'.*export the run again"):
+        load_model(tmp_path)
+
+
+TWICE = """
+import pathlib, sys
+import radejax
+from radejax.inference.export import export
+here = pathlib.Path(radejax.__file__).parent
+assert here.is_relative_to(pathlib.Path(sys.argv[1]).parent)
+export(radejax.Detector.from_workdir(here / "cli" / "demo_model"), sys.argv[1])
+"""
+
+
+@pytest.mark.slow
+def test_two_installs_export_the_same_bytes(tmp_path):
+    package = pathlib.Path(radejax.__file__).parent
+    contents = []
+    for name in ("a", "another/b"):
+        shutil.copytree(package, tmp_path / name / "radejax")
+        out = tmp_path / name / "exported"
+        subprocess.run(
+            [sys.executable, "-c", TWICE, out],
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONPATH": str(tmp_path / name)},
+            check=True,
+        )
+        contents.append({path.name: path.read_bytes() for path in out.iterdir()})
+    assert contents[0].keys() == contents[1].keys()
+    for name, data in contents[0].items():
+        assert data == contents[1][name], name
+        assert b'.py"' not in data
+        assert str(tmp_path).encode() not in data
 
 
 @pytest.mark.parametrize(
@@ -270,6 +399,9 @@ def test_onnx_files_give_the_same_boxes(kind, tmp_path):
     if kind == "camera":
         arguments, inputs = _camera_inputs(detector, count, embedded=True)
     export.export(detector, tmp_path, kind="onnx", batch_size=count)
+    inputs_of_loader = arguments
+    if kind == "camera":
+        inputs_of_loader = (*arguments[:2], dict(vars(arguments[2])))
 
     def run(file, feed):
         session = runtime.InferenceSession(tmp_path / file)
@@ -286,7 +418,21 @@ def test_onnx_files_give_the_same_boxes(kind, tmp_path):
         detector.variables, *arguments
     )
     rows = json.loads((tmp_path / "inputs.json").read_text())
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = 1
+    found = exported_loader.load(tmp_path, session_options=options)(
+        *inputs_of_loader, score_threshold=0.1
+    )
+    _check({f"{name}_": x for name, x in found.items()}, "", detector(*arguments))
     session = runtime.InferenceSession(tmp_path / "detector.onnx")
+    told = session.get_modelmeta().custom_metadata_map
+    assert json.loads(told["classes"]) == list(detector.classes)
+    assert json.loads(told["decode"])["score_threshold"] == 0.1
+    assert json.loads(told["grid"]) == detector.grid.to_dict()
+    assert json.loads(told["radejax"]) == radejax.__version__
+    for name, value in (("score_threshold", 0.1), ("roi", (20, 0, -5, 5, -9, 9))):
+        feed[name] = np.asarray(value, np.float32)  # as the page says, no error
+    assert not run("detector.onnx", inputs | feed)["is_valid"].any()
     assert [row["name"] for row in rows] == [x.name for x in session.get_inputs()]
     assert [row["shape"] for row in rows] == [x.shape for x in session.get_inputs()]
     rows = json.loads((tmp_path / "outputs.json").read_text())

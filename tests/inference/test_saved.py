@@ -289,7 +289,7 @@ def test_whatever_is_wrong_in_the_config_is_named(tmp_path):
     content = json.loads(path.read_text())
     config = content["config"]
     for change, message in (
-        ({"format": "other"}, "format is 'other'"),
+        ({"format": "other"}, "format is 'other', .*: export the run again with"),
         ({"config": {**config, "classes": ["Sedan"]}}, "num_classes is 5, expected 1"),
         ({"config": {**config, "model": {**config["model"], "neck": "x"}}}, "neck is"),
         ({"config": {**config, "model": 3}}, "config.json: config.model is 3"),

@@ -12,10 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 from jax.sharding import Mesh
+from PIL import Image
 
 from radejax.config import Config, load_config
 from radejax.core import devices
 from radejax.core.errors import UserError
+from radejax.core.version import __version__, radejax_commit
 from radejax.data.kradar import dataset
 from radejax.inference.detect_files import detect_files, find_inputs
 from radejax.inference.detector import Detector
@@ -145,6 +147,20 @@ def test_a_run_of_two_frames(
         == json.loads((folder / "run.json").read_text())["input"]
     )
     assert "in the training: detections" not in caplog.text
+    origin = detector.saved.identity
+    assert origin["run"] == "run"
+    assert origin["radejax_commit"] == radejax_commit()
+    assert origin["data"]["license"] == "Apache-2.0, that of radejax"
+    assert origin["metrics"]["split"] == "test"
+    assert all("/all/" in name for name in origin["metrics"]["ap"])
+    report = (folder / "evaluation" / "report.txt").read_text()
+    told = (
+        f"step {origin['step']}, data data, split test, radejax {__version__}, commit "
+    )
+    assert told in report
+    figure = folder / "evaluation" / "precision_recall_3d_iou30.png"
+    with Image.open(figure) as image:
+        assert told in image.info["Description"]
     one = config.replace(data={"num_frames": 1})
     with pytest.raises(UserError, match=r"run do not fit config.model .*stem/doppler"):
         experiment.run(one, tmp_path / "one", init_from=folder, mesh=one_device)
@@ -233,7 +249,7 @@ def test_commit_and_own_parts_of_a_run_are_stored(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert experiment.run_info(tmp_path)["commit"] is None
+    assert experiment.run_info(tmp_path)["commit"] == "not in a repository"
     own = tmp_path / "own_terms.py"
     own.write_text("def size(pairs, options):\n    return 0.0\n")
     name = ["-c", "user.name=a", "-c", "user.email=a@b"]

@@ -600,6 +600,7 @@ class KRadar(LabelledFrames[Frame]):
 
     reader_version = None
     has_label_versions = True
+    license = "CC BY-NC-ND, that of K-Radar"
 
     def __init__(
         self,

@@ -35,6 +35,7 @@ from radejax.data.kradar import reduced
 from radejax.data.projection import (
     MAX_LEVEL,
     MAX_ZERO_SHARE,
+    MIN_LEVEL,
     find_problem,
     project_columns,
     project_tensor,
@@ -115,15 +116,15 @@ def read_projection_npy(
     Raises:
         FileNotFoundError: There is no such file.
         DataError: The file is truncated, corrupted or of another shape or type, or has values
-            that are not finite or beyond `MAX_LEVEL`.
+            that are not between `MIN_LEVEL` and `MAX_LEVEL`.
     """
     stored = read_npy(path)
     axes = _projection_axes(path, stored, projection_shape)
-    is_possible = np.abs(stored) <= MAX_LEVEL  # False for NaN
+    is_possible = (stored >= MIN_LEVEL) & (stored <= MAX_LEVEL)  # False for NaN
     if not is_possible.all():
         raise DataError(
             f"{path}: corrupted, {int((~is_possible).sum())} of {stored.size} values are "
-            f"not finite or beyond {MAX_LEVEL:g}, which no power gives"
+            f"not between {MIN_LEVEL:g} and {MAX_LEVEL:g}, which no power gives"
         )
     if (share := np.mean(stored == 0)) > MAX_ZERO_SHARE:
         raise DataError(f"{path}: corrupted, {share:.0%} of the values are exactly 0")
