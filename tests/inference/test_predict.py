@@ -116,7 +116,9 @@ def test_scores_during_training_name_their_protocol(setup):
     # The loss is the mean of the losses of single frames.
     table = make_table(setup.records, setup.frames, max_objects=30)
     one_by_one = LoaderOptions(1, shuffle=False, num_epochs=1, num_threads=0)
-    grid = models.map_grid(setup.records.grid, setup.model, "bins")
+    grid = models.map_grid(
+        setup.records.grid, setup.model, setup.config.data.azimuth_mapping
+    )
     expected = []
     for batch in make_loader(table, one_by_one):
         maps = setup.model.apply(setup.variables, *batch.model_inputs(), train=False)

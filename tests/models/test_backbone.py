@@ -44,9 +44,9 @@ def test_skips_have_the_attention_of_the_config():
         found[cbam] = backbone.apply(variables, x)
     assert np.abs(found["off"] - found[own]).max() > 0.1
     with pytest.raises(
-        UserError, match=r"cbam is None, expected 'official', 'paper', "
+        UserError, match=r"cbam is 'x', expected 'official' or 'paper' or 'off' or mod"
     ):
-        RadeNetOptions(cbam=None)
+        RadeNetOptions(cbam="x")
 
 
 @pytest.mark.parametrize(("doppler_bins", "there"), [(0, "elevation"), (3, "doppler")])
