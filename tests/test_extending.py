@@ -219,13 +219,21 @@ def test_objects_that_cannot_be_learned_are_left_out_and_counted(
         Data(config)
 
 
+@pytest.mark.parametrize("is_flat", [False, True])
 def test_written_folders_are_read(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+    is_flat: bool, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Also those of a radar that measures only range and azimuth, with one bin per axis."""
     text = PAGE.read_text(encoding="utf-8")
     written, *_ = re.findall(r"^```py\n(.*?)^```", text, re.MULTILINE | re.S)
+    if is_flat:
+        written, count = re.subn(
+            r"(elevation_rad|doppler_mps)=.*", r"\1=[0.0],", written
+        )
+        assert count == 2
     monkeypatch.chdir(tmp_path)
-    power = np.random.default_rng(0).exponential(1e3, (32, 64, 2, 48))
+    shape = (1, 64, 1, 48) if is_flat else (32, 64, 2, 48)
+    power = np.random.default_rng(0).exponential(1e3, shape)
     box = (20.0, 1.0, 0.0, 4.2, 1.8, 1.6, 0.1)
     recording = [(power.astype(np.float32), [("Sedan", box)])] * 4
     exec(written, {"recording": recording})
