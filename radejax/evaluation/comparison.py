@@ -333,7 +333,7 @@ def comparison_tables(
             if row[4] != row[5]
         }
         head = [kind.capitalize(), *header]
-        built.append(report.Table(f"{name}-{kind}", title, head, body, best))
+        built.append(report.Table(title, head, body, f"{name}-{kind}", best))
     return built
 
 

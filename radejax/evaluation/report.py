@@ -317,23 +317,23 @@ class Table:
     """A table of a report.
 
     Attributes:
-        name: Short name, see `label`.
         title: Title that describes the numbers in one line.
         header: `[K]` column titles.
         rows: Rows of `K` strings or counts.
+        name: Short name, from which `label` is made; the title if empty.
         best: Row and column of the values that are bold.
     """
 
-    name: str
     title: str
     header: Sequence[str]
     rows: Sequence[Sequence[str | int]]
+    name: str = ""
     best: Collection[tuple[int, int]] = ()
 
     @property
     def label(self) -> str:
         """Label in LaTeX and name of the file of the table."""
-        return re.sub("[^a-z0-9]+", "-", self.name.lower()).strip("-")
+        return re.sub("[^a-z0-9]+", "-", (self.name or self.title).lower()).strip("-")
 
     def render(self, style: str = "text", *, is_simulated: bool = False) -> str:
         """Renders the table as "text", "markdown" or "latex" (with caption and label)."""
@@ -443,9 +443,8 @@ def _table_of(
     ]
     titles = {"cls": "Class", "ap": "AP", "num gt": "Objects", "count": "Matches"}
     words = [name.removesuffix("_median").replace("_", " ") for name in names]
-    return Table(
-        label, title, [titles.get(word, word.capitalize()) for word in words], rows
-    )
+    header = [titles.get(word, word.capitalize()) for word in words]
+    return Table(title, header, rows, label)
 
 
 # Published rows -----------------------------------------------------------------------
@@ -584,9 +583,8 @@ class RunTables:
             body.append([cls, *map(" / ".join, entries)])
         title = f"AP 3D / BEV at IoU {iou:g}, {self._terms(protocol)}"
         name = f"weather-{protocol}-iou{100 * iou:.4g}"
-        return Table(
-            name, title, ["Class", *(TITLES.get(x, x) for x in conditions)], body
-        )
+        header = ["Class", *(TITLES.get(x, x) for x in conditions)]
+        return Table(title, header, body, name)
 
     def by_protocol(self, space: str, iou: float) -> Table:
         """Builds the table of protocols by classes over all weathers.
@@ -604,7 +602,7 @@ class RunTables:
             count = self.options.bootstrap
             title += f", 95 % intervals of {count} resamples of sequences"
         name = f"protocols-{space}-iou{100 * iou:.4g}"
-        return Table(name, title, ["Protocol", *classes], body)
+        return Table(title, ["Protocol", *classes], body, name)
 
     def papers(self) -> list[Table]:
         """Builds the tables in the papers' layouts that the classes and IoUs allow.
@@ -706,7 +704,7 @@ class RunTables:
             for column in range(4, 4 + len(cells)):
                 best |= best_rows(body, rows, column)
         header = ["Method", "Of", "Source", "Terms", *map(_name, columns)]
-        return Table(name, title, header, body, best)
+        return Table(title, header, body, name, best)
 
     def _differences(self, row: PublishedRow, cells: Sequence[Cell]) -> list[str]:
         """Formats our APs minus the printed ones, with "-" if they are not comparable.

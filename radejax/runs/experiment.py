@@ -607,7 +607,7 @@ def _write_summary(
             lines.append([*line, mean, *numbers(aps)])
     title = f"AP, mean ± standard deviation over {len(tables)} seeds, all weathers"
     header = ["Class", "Protocol", "AP", "IoU", "Mean", *(f"Seed {x}" for x in tables)]
-    table = Table("seeds", title, header, lines)
+    table = Table(title, header, lines, "seeds")
     is_simulated = rows[0]["name"].endswith("/simulated")
     text = table.render(is_simulated=is_simulated)
     files.write_json(workdir / "seeds.json", rows)

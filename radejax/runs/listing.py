@@ -65,7 +65,7 @@ def table_of_runs(rows: list[JsonObject]) -> str:
         body.append([row["run"], fields, *scores])
     metric = ["Metric"] if len(metrics) > 1 else []
     header = ["Run", "Fields that differ", "AP", *metric, "Minutes", "Step"]
-    return Table("runs", title or "no run is evaluated", header, body).render()
+    return Table(title or "no run is evaluated", header, body).render()
 
 
 def _fields(values: JsonObject, prefix: str = "") -> Iterator[tuple[str, object]]:

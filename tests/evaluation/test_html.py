@@ -26,8 +26,8 @@ METRICS = {
     "intervals": "none",
 }
 TABLES = [
-    Table("one", "First", ["Class", "AP"], [["a", "9.50"], ["b", "-"], ["c", "10.20"]]),
-    Table("two", "Second", ["Class", "AP"], [["a", "1"], ["b", "2"]], {(1, 1)}),
+    Table("First", ["Class", "AP"], [["a", "9.50"], ["b", "-"], ["c", "10.20"]], "one"),
+    Table("Second", ["Class", "AP"], [["a", "1"], ["b", "2"]], "two", {(1, 1)}),
 ]
 WEATHERS = ("fog", "rain", "fog")
 
