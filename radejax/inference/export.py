@@ -328,15 +328,23 @@ _UNITS = {
 }
 
 
-def _described(arrays: Iterable[tuple[str, _Shaped]]) -> bytes:
-    """Return a list of the inputs or outputs of a program as JSON, null for any size."""
+def _described(
+    arrays: Iterable[tuple[str, _Shaped]],
+    other: str = "weights: the tensor in model.safetensors",
+) -> bytes:
+    """Return a list of the inputs or outputs of a program as JSON, null for any size.
+
+    Args:
+        arrays: Names and shapes.
+        other: Text for those that are not in `_UNITS`.
+    """
     rows = [
         {
             "index": index,
             "name": name,
             "shape": [n if isinstance(n, int) else None for n in x.shape],
             "dtype": str(x.dtype),
-            "unit": _UNITS.get(name, "weights: the tensor in model.safetensors"),
+            "unit": _UNITS.get(name, other),
         }
         for index, (name, x) in enumerate(arrays)
     ]
@@ -358,7 +366,8 @@ def _detect(
     problems = jnp.stack(find_invalid(frames, are_tensors=are_tensors))
     num_invalid = problems.any(axis=0).sum(axis=-1, dtype=jnp.int32)
     results = vars(found) | {"num_invalid": num_invalid}
-    return {name: results[name] for name in RESULTS}
+    own = dict(sorted(found.outputs.items()))
+    return {name: results[name] for name in RESULTS} | own
 
 
 @contextlib.contextmanager
@@ -402,10 +411,11 @@ def _stablehlo(
     names = [*sorted(weights), *_names(inputs), *_SETTINGS]
     kept = exported.module_kept_var_idx  # a program has only the inputs that it uses
     used = [(names[i], exported.in_avals[i]) for i in kept]
+    results = jax.tree.unflatten(exported.out_tree, exported.out_avals)
     contents = {
         PROGRAM_FILE: bytes(exported.serialize()),
         INPUTS_FILE: _described(used),
-        OUTPUTS_FILE: _described(zip(sorted(RESULTS), exported.out_avals, strict=True)),
+        OUTPUTS_FILE: _described(results.items(), "output of the model's own"),
     }
     if batch_size and len(platforms) == 1:
         contents[BYTECODE_FILE] = exported.mlir_module_serialized
@@ -466,11 +476,10 @@ def _onnx_files(
         maps: Any = detector.model.apply(variables, projection, *camera, train=False)
         return [maps.heatmap_logits, maps.box_params]
 
-    def program(*arrays: jax.Array) -> list[jax.Array]:
+    def program(*arrays: jax.Array) -> dict[str, jax.Array]:
         given = jax.tree.unflatten(tree, arrays[: len(leaves)])
         settings = Settings(*arrays[len(leaves) :])
-        found = _detect(detector, variables, given, settings)
-        return list(found.values())
+        return _detect(detector, variables, given, settings)
 
     def convert(
         function: Callable[..., list[jax.Array]],
@@ -484,14 +493,20 @@ def _onnx_files(
         return bytes(converted.SerializeToString())
 
     every = inputs | _SETTINGS
-    outputs = jax.eval_shape(program, *every.values())
+    shapes_of = jax.eval_shape(program, *every.values())
+    names = [*RESULTS, *sorted(shapes_of.keys() - set(RESULTS))]
+    results = {name: shapes_of[name] for name in names}
+
+    def listed(*arrays: jax.Array) -> list[jax.Array]:
+        return list(program(*arrays).values())
+
     # onnx_ir warns of every shape that is not static.
     logging.getLogger("onnx_ir").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Explicitly requested dtype float64")
         return {
             "network.onnx": convert(network, inputs, ("heatmap_logits", "box_params")),
-            "detector.onnx": convert(program, every, RESULTS),
+            "detector.onnx": convert(listed, every, names),
             INPUTS_FILE: _described(every.items()),
-            OUTPUTS_FILE: _described(zip(RESULTS, outputs, strict=True)),
+            OUTPUTS_FILE: _described(results.items(), "output of the model's own"),
         }
