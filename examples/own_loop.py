@@ -6,6 +6,7 @@ Copy it to change what a step does. `radejax train` has the rest: it continues a
 interruption, logs, evaluates, and uses all devices.
 """
 
+import click
 import jax
 import optax
 
@@ -14,7 +15,7 @@ from radejax.losses.detection import detection_loss
 from radejax.runs.data import located, open_data
 
 
-def main(name: str = "quickstart:short", num_steps: int = 50) -> Detector:
+def train(name: str = "quickstart:short", num_steps: int = 50) -> Detector:
     """Trains a model on simulated frames, and prints what it detects in one of them."""
     config = located(load_config(name))
     data = open_data(config)  # simulates and preprocesses what is missing
@@ -45,6 +46,14 @@ def main(name: str = "quickstart:short", num_steps: int = 50) -> Detector:
     for box in detector(data.records[frames[0].key]).to_list()[0]:
         print(box)
     return detector
+
+
+@click.command()
+@click.option("--config", default="quickstart:short", help="Config to train.")
+@click.option("--steps", default=50, help="Number of steps.")
+def main(config: str, steps: int) -> None:
+    """Train for a few steps, and print the boxes of a frame."""
+    train(config, steps)
 
 
 if __name__ == "__main__":

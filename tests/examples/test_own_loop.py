@@ -13,7 +13,7 @@ def test_the_loop_of_the_guide_trains(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    detector = own_loop.main(num_steps=31)
+    detector = own_loop.train(num_steps=31)
     losses = [
         float(line.partition("'focal': ")[2].partition(",")[0])
         for line in capsys.readouterr().out.splitlines()
