@@ -64,6 +64,7 @@ def _config() -> Config:
         "name": "parts:PowerNet",
         "exponent": 3.0,
         "backbone": "parts:FlatBackbone",
+        "cbam": "parts:Gate",
         "neck": "parts:StripNeck",
         "heads": "parts:WideHead",
     }
