@@ -258,7 +258,7 @@ def find_problems(
     return ~is_level, is_empty, is_constant, is_decibels
 
 
-def find_problem(beams: Float[np.ndarray, "_ _"], lowest_power: float) -> str | None:
+def find_problem(beams: Float[np.ndarray, "..."], lowest_power: float) -> str | None:
     """Describes why values cannot come from linear power; returns None if they can.
 
     Args:
@@ -268,7 +268,7 @@ def find_problem(beams: Float[np.ndarray, "_ _"], lowest_power: float) -> str | 
     lowest = np.array([np.nan])
     if lowest_power >= 0:
         lowest = to_log_scale(np.array([lowest_power]))
-    found = find_problems(beams[None], lowest)
+    found = find_problems(beams.reshape(1, 1, -1), lowest)
     return next((text for text, x in zip(PROBLEMS, found, strict=True) if x[0]), None)
 
 
