@@ -66,9 +66,9 @@ _OF_MODELS = {
 _COMPILE_OPTIONS = bytes.fromhex("1a0420012801")
 """XLA's `CompileOptionsProto` for one replica and one partition."""
 
-_TESTED_JAX = {"smallest": "0.9.2", "exported": "0.10.2"}
+_SMALLEST_JAX = "0.9.2"
+_TESTED_JAX = 0, 10, 2
 """Smallest version of JAX that reads what versions up to the second one export."""
-
 
 CHUNK_SIZE = 1024
 """Default chunk size of the deformable attention in ONNX files, in bins."""
@@ -188,13 +188,12 @@ def _jax_versions() -> dict[str, str]:
     Older versions than the tested ones may not know operations that newer ones write. JAX
     reads what was exported six months before, which is about two minor versions.
     """
-    exported = jax.__version__.split("+")[0]
-    major, minor, patch = (int(x) for x in re.findall("[0-9]+", exported)[:3])
-    *tested, last = map(int, _TESTED_JAX["exported"].split("."))
-    is_tested = (major, minor, patch) <= (*tested, last)
+    version = jax.__version__
+    major, minor = jax.__version_info__[:2]
+    is_tested = jax.__version_info__ <= _TESTED_JAX
     return {
-        "smallest": _TESTED_JAX["smallest"] if is_tested else exported,
-        "exported": exported,
+        "smallest": _SMALLEST_JAX if is_tested else version,
+        "exported": version,
         "largest": f"{major}.{minor + 1}",
     }
 
@@ -238,28 +237,19 @@ def _readme(
         count=config.decode.max_detections,
         left_out=_LEFT_OUT if content["left_out"] else "nothing",
         origin=_SIMULATED if is_simulated else _MEASURED,
-        identity="\n".join(f"| {n} | {x} |" for n, x in _origin(content).items() if x),
+        identity=_origin(content),
         files="\n".join(f"- `{n}`: {x}" for n, x in listed.items()),
     )
 
 
-def _origin(content: JsonObject) -> dict[str, str]:
-    """Return what identifies a model as text by name, empty where it is not known."""
-    known = content["identity"]
-    metrics = known.get("metrics")
-    lines = {name: known.get(name, "not known") for name in ("run", "step", "date")}
-    lines |= {f"data {n}": x for n, x in known.get("data", {}).items()}
-    lines["trained with"] = ", ".join(
-        f"{name} {x}" for name, x in known.get("versions", {}).items()
-    )
-    lines["trained in clone"] = known.get("commit", "")
-    lines["with radejax of"] = known.get("radejax_commit", "")
-    lines["exported with"] = f"radejax {content['radejax']}, commit {content['commit']}"
-    if not metrics:
-        return lines | {"metrics": "this step was not evaluated on the test split"}
-    place = f"{metrics['num_frames']} frames of the {metrics['split']} split"
-    lines["AP in %"] = f"{place} of {metrics['data']}, {metrics['evaluation']}"
-    return lines | {f"`{name}`": f"{ap:.2f}" for name, ap in metrics["ap"].items()}
+def _origin(content: JsonObject) -> str:
+    """Return the rows of a table of what identifies a model."""
+    known = {"run": "not known", "metrics": None} | content["identity"]
+    known["export"] = {"radejax": content["radejax"], "commit": content["commit"]}
+    values = flatten_dict(known, sep=" ").items()
+    texts = {n: f"{x:.4g}" if isinstance(x, float) else x for n, x in values}
+    rows = (f"| {n} | {'none' if x is None else x} |" for n, x in texts.items())
+    return "\n".join(rows)
 
 
 # Programs ----------------------------------------------------------------------------
