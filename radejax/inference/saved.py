@@ -112,7 +112,10 @@ class SavedModel:
             _log.warning(
                 "the input is %.3f ± %.3f, and %.3f ± %.3f in the training: detections are "
                 "not reliable; expected linear power of a radar with the same gain",
-                *(mean, spread, usual, scale),
+                mean,
+                spread,
+                usual,
+                scale,
             )
         return is_near
 
