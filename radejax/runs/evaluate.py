@@ -147,11 +147,17 @@ class Evaluation:
         """
         losses: list[Losses] = []
         placed = self._detector.replace(variables=variables).variables
+
+        def add_losses(batch: Batch) -> None:
+            # It is waited for: with several batches in flight, CPU devices that share cores
+            # can fail to synchronize.
+            losses.append(jax.device_get(self._sum_losses(placed, batch)))
+
         predictions = self.predict(
             variables,
             progress=False,
             should_stop=should_stop,
-            each_batch=lambda batch: losses.append(self._sum_losses(placed, batch)),
+            each_batch=add_losses,
         )
         data = make_set(self._truth, predictions, self._table, self._options)
         # Without the frame table, there are no weathers and no intervals.
