@@ -53,7 +53,7 @@ def test_a_simulated_recording_is_trained_evaluated_and_drawn(
     tmp_path: pathlib.Path,
 ) -> None:
     root, run = tmp_path / "data", tmp_path / "run"
-    arguments = [str(root), "--workdir", str(run), "--drives", "20", "--epochs", "1"]
+    arguments = [str(root), "--workdir", str(run), "--drives", "30", "--epochs", "1"]
     result = CliRunner().invoke(own_adc.main, arguments, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     assert (root / "frame.png").stat().st_size > 10_000
