@@ -226,16 +226,12 @@ def _scene(
 ) -> radejax.Scene:
     """Reads a frame and returns its scene, with detections if there is a detector."""
     projection = frame.read_projection(grid)
-    scene = radejax.frame_scene(frame, projection, grid, **fields)
-    if detector is None:
-        return scene
-    image = camera = None
-    if detector.takes_camera and scene.camera is not None:
-        image = [frame.camera_path]
-        camera = scene.camera
-    threshold = detector.decode_options.score_threshold
-    found = detector(projection, image, camera).to_boxes()
-    return dataclasses.replace(scene, predictions=found, score_threshold=threshold)
+    if detector is not None:
+        _, camera = radejax.front_view(frame) if detector.takes_camera else (None, None)
+        image = None if camera is None else [frame.camera_path]
+        fields["predictions"] = detector(projection, image, camera).to_boxes()
+        fields["score_threshold"] = detector.decode_options.score_threshold
+    return radejax.frame_scene(frame, projection, grid, **fields)
 
 
 @click.command(cls=entry.Command)

@@ -152,7 +152,8 @@ def test_detections_of_a_run_are_drawn_beside_the_labels(
     monkeypatch.setattr(radejax.Detector, "from_workdir", lambda _: Detector())
     _run("1", root, "--workdir", root)
     texts = [text.get_text() for text in drawn[0].legends[0].get_texts()]
-    assert texts[1] == "prediction (1), score ≥ 0.25"
+    assert texts[4] == "false positive (1)"
+    assert texts[-1] == "score ≥ 0.25, IoU > 0.3"
     assert "Sedan 0.90" in [text.get_text() for text in drawn[0].axes[0].texts]
     error = _run("1", root, "--workdir", root, "--slices", code=2).stderr
     assert "--slices shows no detections" in error
