@@ -272,6 +272,7 @@ def test_a_wrong_part_is_named(name: str, value: Any, message: str) -> None:
 @pytest.mark.slow
 def test_own_parts_are_imported_wherever_a_run_is_opened(
     tmp_path: pathlib.Path,
+    caplog: pytest.LogCaptureFixture,
     monkeypatch: pytest.MonkeyPatch,
     one_device: jax.sharding.Mesh,
 ) -> None:
@@ -286,7 +287,15 @@ def test_own_parts_are_imported_wherever_a_run_is_opened(
     terms = ("focal", "gwd", "height_loss", "velocity_loss")
     assert np.isfinite([row[name] for name in terms]).all()
     _forget()
-    assert evaluate_run(folder) is not None
+    out = tmp_path / "results"
+    out.mkdir()
+    (out / "metrics.json").write_text('{"run": "other"}')
+    with caplog.at_level("WARNING", "radejax"):
+        assert evaluate_run(folder, out=out) is not None
+        assert f"{out}: the results of other are replaced" in caplog.text
+        caplog.clear()
+        assert evaluate_run(folder) is not None
+    assert "are replaced" not in caplog.text
     metrics = json.loads((folder / "evaluation" / "metrics.json").read_text())
     assert metrics["options"]["protocols"] == ["parts:EVERY_FRAME", "all_point"]
     _forget()

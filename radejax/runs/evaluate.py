@@ -230,13 +230,17 @@ class Evaluation:
         """
         predictions = self.predict(variables)
         place = out or workdir / "evaluation"
+        name = run or workdir.name
+        if (before := place / "metrics.json").exists():
+            other = files.read_object(before).get("run")
+            if other != name:
+                _log.warning("%s: the results of %s are replaced", place, other)
 
         def write() -> Report:
             with files.swapped_in(place, *_STALE, *STALE) as folder:
                 files.write_json(folder / "source.json", {"step": step, **self._source})
                 data_name = self._data.describe()["name"]
-                origin = f"{run or workdir.name}, step {step}, data {data_name}, split "
-                origin += self._split
+                origin = f"{name}, step {step}, data {data_name}, split {self._split}"
                 draw_scenes = functools.partial(self._draw_scenes, predictions, origin)
                 report = write_report(
                     self._truth,
@@ -244,7 +248,7 @@ class Evaluation:
                     self._table,
                     folder,
                     self._options,
-                    run=run or workdir.name,
+                    run=name,
                     step=step,
                     data_name=data_name,
                     left_out=self._frames.summary().counts,
