@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from flax.traverse_util import flatten_dict
 from matplotlib.figure import Figure
 
 from radejax.core import devices
@@ -210,6 +211,34 @@ def test_a_run_continues_with_the_same_data_and_frozen_weights_only(
         run(finished, info={"same": SAME | {"sha256 of their keys": "cd"}})
     assert _losses(finished) == _losses(undisturbed[1])
     check_equal(run(finished, info={"same": SAME}), undisturbed)
+
+
+@pytest.mark.slow
+def test_frozen_parameters_are_saved_and_stay_as_they_were(
+    run: Any, tiny: Tiny, workdir: pathlib.Path
+) -> None:
+    freeze = ("backbone/encoder_*",)
+
+    def train(steps: int) -> TrainState:
+        length = {"freeze": freeze, "max_steps": steps}
+        state: TrainState = run(workdir, config=tiny.config.replace(train=length))[0]
+        return state
+
+    train(3)
+    with Checkpoints(workdir / "checkpoints", read_only=True) as checkpoints:
+        saved, *_ = checkpoints.restore_variables()
+    whole = flatten_dict(dict(tiny.variables["params"]), sep="/")
+    frozen = flatten_dict(saved["frozen"], sep="/")
+    expected = {name for name in whole if name.startswith("backbone/encoder_")}
+    assert frozen.keys() == expected
+    for name, values in frozen.items():
+        np.testing.assert_array_equal(values, whole[name])
+    assert not expected & flatten_dict(saved["params"], sep="/").keys()
+    state = train(6)  # from the checkpoint
+    chex.assert_trees_all_equal(state.frozen, saved["frozen"])
+    assert int(state.step) == 6
+    changed = flatten_dict(dict(state.params), sep="/")
+    assert all((changed[name] != whole[name]).any() for name in changed)
 
 
 def test_no_more_than_two_steps_are_under_way(
