@@ -9,9 +9,12 @@ paths are completed, and all of them are made absolute.
 from __future__ import annotations
 
 import ast
+import hashlib
 import importlib.util
+import logging
 import os
 import pathlib
+import sys
 import types
 from collections.abc import Collection, Mapping
 from typing import Annotated, Any
@@ -40,6 +43,8 @@ from radejax.losses.detection import LossOptions
 from radejax.models.options import RadeNetOptions
 from radejax.simulation.config import SimulationOptions
 from radejax.training.options import LoggingOptions, TrainOptions
+
+_log = logging.getLogger(__name__)
 
 CONFIGS = pathlib.Path(__file__).resolve().parent / "configs"
 """Folder of the bundled configs; in a checkout, a link to the one next to the package."""
@@ -124,6 +129,40 @@ class Config(Options):
         self.train.find_functions()
         for function in self.data.augmentation:
             find_function(function, "config.data.augmentation")
+
+    def own_parts(self) -> dict[str, str]:
+        """Returns the SHA-256 of the file of each part that is named as "module:Object".
+
+        Parts that were not imported are left out, see `check_imports`.
+        """
+        values = (value for name, value in self.fields() if name != "data.roots")
+        names = (
+            x for value in values for x in (value if type(value) is tuple else [value])
+        )
+        found = {}
+        for name in names:
+            module = sys.modules.get(str(name).partition(":")[0])
+            path = getattr(module, "__file__", None)
+            if isinstance(name, str) and ":" in name and path is not None:
+                content = pathlib.Path(path).read_bytes()
+                found[name] = hashlib.sha256(content).hexdigest()
+        return found
+
+    def check_parts(self, before: Mapping[str, str], run: object) -> None:
+        """Warns of parts whose files have changed since a run was started.
+
+        Args:
+            before: Result of `own_parts` at that time.
+            run: Name of the run for the warning.
+        """
+        now = self.own_parts().items()
+        if changed := [name for name, sha in now if before.get(name, sha) != sha]:
+            _log.warning(
+                "%s: the file of %s has changed since the training was started: results may "
+                "be others",
+                run,
+                ", ".join(changed),
+            )
 
     def without_data_paths(self) -> JsonObject:
         """Returns plain values for JSON with the data paths (`DATA_PATHS`) emptied."""

@@ -1,5 +1,6 @@
 """Untrained detectors of a few thousand parameters, with and without a camera."""
 
+import dataclasses
 import functools
 import json
 import pathlib
@@ -124,6 +125,15 @@ def detector(kind: str = "radar", *, num_frames: int = 1, **overrides: Any) -> D
     """The same detector for the same arguments, so that it is compiled once."""
     options = {"batch_sizes": (4,), "score_threshold": 0.1} | overrides
     return Detector(saved(kind, data__num_frames=num_frames), **options)
+
+
+def detector_with_output(**options: Any) -> Detector:
+    """A detector with an own output "velocity" of two channels."""
+    made = saved(model__outputs={"velocity": 2})
+    inputs = np.zeros((1, *small_grid().projection_shape), np.float32)
+    variables = jax.jit(made.model.init)(jax.random.key(0), inputs)
+    made = dataclasses.replace(made, variables=variables)
+    return Detector(made, **{"score_threshold": 0.1, **options})
 
 
 def saved(kind: str = "radar", **changes: Any) -> SavedModel:

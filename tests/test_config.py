@@ -19,7 +19,9 @@ from radejax.config import (
     with_texts,
 )
 from radejax.core.errors import UserError
+from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.options import DinoRadeOptions
+from radejax.simulation.config import SimulationOptions
 
 CONFIGS = pathlib.Path(__file__).resolve().parents[1] / "configs"
 NAN, INF = math.nan, math.inf
@@ -303,3 +305,15 @@ def test_data_paths_differ_from_machine_to_machine() -> None:
     assert values == WHOLE.without_data_paths()
     assert values["data"]["embeddings"] is None
     assert values["train"]["batch_size"] == WHOLE.train.batch_size
+
+
+def test_axes_replace_the_arguments_of_a_reduced_grid() -> None:
+    """The field has two kinds of sections, whose fields are not merged."""
+    grid = RadarGrid.kradar()
+    options = SimulationOptions()
+    changed = options.replace(grid=grid.to_dict())
+    assert changed.make_grid() == grid
+    assert options.with_fields({"grid": grid.to_dict()}) == changed
+    assert options.replace(grid={"num_range": 32}).make_grid().num_range == 32
+    with pytest.raises(UserError, match=r"^config\.simulation\.grid\.num_"):
+        options.replace(grid={"num_rang": 32})

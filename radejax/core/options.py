@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import importlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Self, TypeVar, get_args
 
 import numpy as np
 import pydantic
@@ -128,9 +128,22 @@ def _merged(
         if rest:
             change = {rest: change}
         if isinstance(change, Mapping) and isinstance(inner, Options | Mapping):
-            change = _merged(inner, change)
+            is_whole = _is_of_another_kind(section, name, change)
+            change = change if is_whole else _merged(inner, change)
         values[name] = change
     return values
+
+
+def _is_of_another_kind(
+    owner: Options | Mapping[str, object], name: str, change: Mapping[str, object]
+) -> bool:
+    """Returns whether a section of several kinds is replaced by one of another kind."""
+    inner = getattr(owner, name, None)
+    if not (isinstance(owner, Options) and isinstance(inner, Options)):
+        return False
+    kinds = get_args(type(owner).model_fields[name].annotation)
+    sections = [x for x in kinds if isinstance(x, type) and issubclass(x, Options)]
+    return len(sections) > 1 and type(inner).model_fields.keys().isdisjoint(change)
 
 
 def as_tuples(value: object) -> object:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from jaxtyping import Float, Int, Real
 
-from radejax.core.errors import UserError
+from radejax.core.errors import UserError, require
 from radejax.geometry.camera import Camera
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -72,6 +72,10 @@ class Augmentation:
             sample = mirror(sample)
         for function in self.others:
             sample = function(sample, rng)
+            kind = type(sample).__name__
+            name = getattr(function, "__name__", "a function")
+            name = f"the result of {name} in config.data.augmentation"
+            require(isinstance(sample, Sample), name, kind, "a Sample")
         return sample
 
 

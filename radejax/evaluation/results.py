@@ -312,7 +312,8 @@ def sequence_weights(
     names, inverse = np.unique(sequence, return_inverse=True)
     if names.size < 2:
         raise UserError(
-            f"intervals need at least 2 sequences to resample, found {names.size}"
+            f"intervals need at least 2 sequences to resample, found {names.size}: evaluate "
+            "more, such as --split all"
         )
     rng = np.random.default_rng(seed)
     drawn = rng.multinomial(names.size, np.full(names.size, 1 / names.size), resamples)

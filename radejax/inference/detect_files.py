@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import itertools
+import logging
 import pathlib
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -35,6 +36,8 @@ from radejax.inference.detector import Detector, Item
 from radejax.inference.inputs import InputReader
 from radejax.inference.predict import Batches, detect_batches
 from radejax.weights.image_backbone import weights_sha256
+
+_log = logging.getLogger(__name__)
 
 View = tuple[pathlib.Path | None, Camera | None]
 """Front image and camera of a frame."""
@@ -332,6 +335,9 @@ def detect_files(
             Boxes.concatenate(found or [Boxes.one_frame([], [], [])]),
             keys,
         )
+    if file_format == "kitti" and detector.saved.config.model.outputs:
+        own = ", ".join(detector.saved.config.model.outputs)
+        _log.warning("the format kitti has no columns for %s: not written", own)
     if detector.num_frames > 1:
         count["repeated"] = len(dataclasses.replace(inputs, keys=seen).parts(2))
     if detector.takes_camera:
@@ -415,7 +421,14 @@ def _single(
 def _write_csv(path: pathlib.Path, boxes: Boxes, keys: Sequence[str]) -> None:
     """Write all boxes as one table with the keys of their frames."""
     with files.atomic_path(path) as temporary, open(temporary, "w") as file:
+        # A column with several values per box becomes several columns.
+        columns = {
+            f"{name}_{i}" if x.ndim > 1 else name: column
+            for name, x in boxes.fields().items()
+            for i, column in enumerate(np.atleast_2d(x.T))
+        }
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["frame", *boxes.fields()])
-        for frame, box in zip(boxes.frame, boxes.to_list(), strict=True):
-            writer.writerow([keys[frame], *box.values()])
+        writer.writerow(["frame", *columns])
+        rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+        for frame, row in zip(boxes.frame, rows, strict=True):
+            writer.writerow([keys[frame], *row])

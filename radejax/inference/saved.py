@@ -341,10 +341,13 @@ def _read_checkpoint(path: pathlib.Path, step: Step) -> SavedModel:
         config = Config(**info["config"])
     except UserError as error:
         version = info["run"].get("versions", {}).get("radejax")
+        if version == __version__:
+            raise
         raise UserError(
             f"{folder}: {error}; the run is of radejax {version}, and this is radejax "
             f"{__version__}: train again, or use that version"
         ) from None
+    config.check_parts(info["run"].get("parts", {}), folder.parent)
     return SavedModel(
         config,
         RadarGrid.from_dict(info["grid"]),
@@ -489,7 +492,15 @@ def matching_weights(path: PathLike, model: RadeNet) -> VariableDict:
         UserError: No weights match.
     """
     wanted = variable_shapes(model)
-    found = flatten_dict(load_model(path).variables, sep="/")
+    other = load_model(path)
+    found = flatten_dict(other.variables, sep="/")
+    there, here = (
+        {name: getattr(options, name) for name in ("doppler_bins", "elevation_bins")}
+        for options in (other.config.model, model.options)
+    )
+    if lines := files.differences(there, here, "config.model"):
+        text = "weights of %s are of another radar, so that the first convolution does not fit: %s"
+        _log.warning(text, path, "; ".join(lines))
     own = tuple(f"params/{part}/" for part in models.external_parts(model))
     found = {name: x for name, x in found.items() if not name.startswith(own)}
     same = {name: x for name, x in found.items() if wanted.get(name) == x.shape}

@@ -173,8 +173,8 @@ class Evaluation:
         if metrics := self._options.find_metrics():
             errors = box_errors(data, self._options.iou_thresholds[0], metrics)
             for name, cls in itertools.product(metrics, errors):
-                median = errors[cls][f"{name}_median"]
-                values[f"{self._split}/{name}_median/{cls}"] = median
+                if not math.isnan(median := errors[cls][f"{name}_median"]):
+                    values[f"{self._split}/{name}_median/{cls}"] = median
         named = {
             f"{self._split}/{name}": figure for name, figure in (drawn or {}).items()
         }

@@ -146,7 +146,9 @@ def run(
             )
         info = run_info(folder, init_from, init_partial)
         info |= {"input": data.usual_input, "data": data.describe()}
-        info |= {"parts": own_parts(config)}
+        info |= {"parts": config.own_parts()}
+        if (before := folder / "run.json").exists():
+            config.check_parts(files.read_object(before).get("parts", {}), folder)
         if devices.is_main():
             files.write_json(folder / "run.json", info)
         training_data = TrainingData(
@@ -382,6 +384,9 @@ def _make_state_and_step(
         data.info.get("same", {}),
         models.external_parts(model),
     )
+    if train.freeze:
+        counts = [len(jax.tree.leaves(part)) for part in (state.frozen, state.params)]
+        _log.info("%d arrays of parameters are frozen, %d are trained", *counts)
     step = make_train_step(
         model,
         optimizer,
@@ -476,24 +481,6 @@ def run_info(
         "device": str(jax.devices()[0].device_kind),
         "command": shlex.join(sys.argv),
     }
-
-
-def own_parts(config: Config) -> dict[str, str]:
-    """Returns the SHA-256 of the file of each part that a config names as module:Object.
-
-    The modules have to be imported before, see `Config.check_imports`.
-    """
-    values = (value for name, value in config.fields() if name != "data.roots")
-    names = (
-        x for value in values for x in (value if type(value) is tuple else [value])
-    )
-    found = {}
-    for name in names:
-        module = sys.modules.get(str(name).partition(":")[0])
-        path = getattr(module, "__file__", None)
-        if isinstance(name, str) and ":" in name and path is not None:
-            found[name] = hashlib.sha256(pathlib.Path(path).read_bytes()).hexdigest()
-    return found
 
 
 def checkpoint_info(

@@ -13,6 +13,9 @@ from radejax.core.files import JsonObject, PathLike
 from radejax.evaluation.report import Table, number
 from radejax.visualize.curves import read_metrics
 
+_MAX_TEXT = 40
+"""Largest number of characters of a value in the table."""
+
 
 def list_runs(folder: PathLike) -> list[JsonObject]:
     """Returns the runs in a folder and its subfolders in the order of their names.
@@ -37,7 +40,7 @@ def list_runs(folder: PathLike) -> list[JsonObject]:
         raise UserError(
             f"no run in {folder}: expected a folder with workdirs of `radejax train`"
         )
-    configs = [dict(_fields(files.read_object(run / "config.json"))) for run in runs]
+    configs = [_config_of(run) for run in runs]
     names = list(dict.fromkeys(name for config in configs for name in config))
     differing = [
         name
@@ -58,7 +61,11 @@ def table_of_runs(rows: list[JsonObject]) -> str:
     title = "; ".join(f"AP: {metric}, {split} split" for metric, split in metrics)
     body = []
     for row in rows:
-        fields = ", ".join(f"{name}={value}" for name, value in row["fields"].items())
+        shown = {name: str(value) for name, value in row["fields"].items()}
+        fields = ", ".join(
+            f"{name}={x if len(x) <= _MAX_TEXT else x[: _MAX_TEXT - 3] + '...'}"
+            for name, x in shown.items()
+        )
         step = "-" if row["step"] is None else row["step"]
         metric = [row["metric"] or "-"] if len(metrics) > 1 else []
         scores = [number(row["ap"]), *metric, number(row["minutes"], digits=1), step]
@@ -66,6 +73,13 @@ def table_of_runs(rows: list[JsonObject]) -> str:
     metric = ["Metric"] if len(metrics) > 1 else []
     header = ["Run", "Fields that differ", "AP", *metric, "Minutes", "Step"]
     return Table(title or "no run is evaluated", header, body).render()
+
+
+def _config_of(run: pathlib.Path) -> JsonObject:
+    """Returns the fields of a run's config, and the weights that it started from."""
+    started = files.read_object(run / "run.json")
+    start = {name: started.get(name) for name in ("init_from", "init_partial")}
+    return {**dict(_fields(files.read_object(run / "config.json"))), **start}
 
 
 def _fields(values: JsonObject, prefix: str = "") -> Iterator[tuple[str, object]]:

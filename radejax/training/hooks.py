@@ -23,7 +23,7 @@ from jaxtyping import Int
 
 from radejax.config import Config
 from radejax.core import devices
-from radejax.core.errors import DataError
+from radejax.core.errors import DataError, require
 from radejax.core.structures import Batch
 from radejax.core.workers import usable_cpus
 from radejax.training.checkpoints import Checkpoints
@@ -57,7 +57,12 @@ def logged(hook: OwnHook, writer: MetricWriter) -> Hook:
     """Returns a hook that writes the values that another one returns, if there are any."""
 
     def call(step: int, state: TrainState, metrics: Metrics) -> None:
-        if values := hook(step, state, metrics):
+        values = hook(step, state, metrics)
+        is_mapping = isinstance(values, Mapping)
+        name = getattr(hook, "__name__", "a function")
+        name = f"the result of {name} in config.train.hooks"
+        require(values is None or is_mapping, name, values, "numbers by name, or None")
+        if values:
             writer.write(step, {name: float(x) for name, x in values.items()})
 
     return call

@@ -41,7 +41,7 @@ class TrainOptions(Options, section="config.train"):
     weight_decay: NotNegative = 0.01
     """Weight decay on every parameter."""
     freeze: tuple[str, ...] = ()
-    """Parameters that are not trained: patterns of their paths, such as
+    """Parts or parameters that are not trained: patterns of their paths, such as
     "backbone/encoder*"; empty: none but those that the model freezes."""
     warmup_steps: Count = 0
     """Steps of a linear warm-up from 0; fewer than the steps of the training."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import fnmatch
+import logging
 from collections.abc import Callable, Iterable, Sequence
 
 import chex
@@ -24,6 +25,8 @@ from radejax.detection.decode import DecodeOptions
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.detection import LossOptions, detection_loss
 from radejax.training.options import TrainOptions
+
+_log = logging.getLogger(__name__)
 
 Metrics = dict[str, Num[jax.Array, ""]]
 Step = Callable[["TrainState", Batch, jax.Array], tuple["TrainState", Metrics]]
@@ -69,6 +72,9 @@ def make_schedule(train: TrainOptions, steps_per_epoch: int) -> optax.Schedule:
     is_shorter = warmup_steps < num_steps
     require(is_shorter, "config.train.warmup_steps", warmup_steps, expected)
     make = find_function(train.schedule, "config.train.schedule", SCHEDULES)
+    if warmup_steps and train.schedule not in SCHEDULES:
+        text = "config.train.warmup_steps=%d has no effect: %s is an own schedule"
+        _log.warning(text, warmup_steps, train.schedule)
     return make(train, num_steps, steps_per_epoch)
 
 
@@ -234,25 +240,30 @@ def freezing(model: nn.Module, patterns: Sequence[str]) -> Callable[[str], bool]
 
     Args:
         model: Model, which may have a method `is_frozen` of the same kind.
-        patterns: Patterns of further parameters, such as "backbone/encoder*".
+        patterns: Patterns of further parameters or parts, such as "backbone/encoder*".
     """
     own = getattr(model, "is_frozen", None)
 
     def is_frozen(path: str) -> bool:
         is_own = own is not None and own(path)
-        return is_own or any(fnmatch.fnmatchcase(path, one) for one in patterns)
+        return is_own or any(_matches(path, pattern) for pattern in patterns)
 
     return is_frozen
+
+
+def _matches(path: str, pattern: str) -> bool:
+    """Returns whether a pattern matches the path of a parameter, or of a part with it."""
+    return any(fnmatch.fnmatchcase(path, x) for x in (pattern, f"{pattern}/*"))
 
 
 def check_patterns(params: Collection, patterns: Sequence[str]) -> None:
     """Raises `UserError` if one of `config.train.freeze` matches no parameter, or all match."""
     paths = list(flatten_dict(params, sep="/"))
-    examples = ", ".join(sorted({path.rpartition("/")[0] for path in paths})[:8])
+    parts = sorted({"/".join(path.split("/")[:2]) for path in paths})
     left = set(paths)
     for pattern in patterns:
-        found = fnmatch.filter(paths, pattern)
-        expected = f"a pattern of paths of parameters, which are in {examples}, ..."
+        found = [path for path in paths if _matches(path, pattern)]
+        expected = f"a pattern of parts of the model: {', '.join(parts)}"
         require(len(found) > 0, "config.train.freeze", pattern, expected)
         left.difference_update(found)
     expected = "patterns that leave parameters to train"

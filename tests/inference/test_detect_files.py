@@ -42,6 +42,25 @@ def _write_projections(folder, names, frames):
         np.save(path, np.moveaxis(frame, -1, 0))
 
 
+def test_own_outputs_are_columns_of_the_table(tmp_path, caplog):
+    detector = small.detector_with_output(batch_sizes=(2,))
+    frames, keys = small.projections(2), ["7/00000", "7/00001"]
+    _write_projections(tmp_path / "data", keys, frames)
+    inputs = find_inputs(detector, [tmp_path / "data"])
+    expected = detector(frames).to_boxes().extras["velocity"]
+    assert len(expected) > 0
+    detect_files(detector, inputs, tmp_path / "csv", file_format="csv")
+    with open(tmp_path / "csv" / "boxes.csv", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    found = [[float(row[f"velocity_{i}"]) for i in (0, 1)] for row in rows]
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    detect_files(detector, inputs, tmp_path / "json")
+    boxes = files.read_json(tmp_path / "json" / "7_00000.json")
+    np.testing.assert_allclose(boxes[0]["velocity"], expected[0], rtol=1e-5)
+    detect_files(detector, inputs, tmp_path / "kitti", file_format="kitti")
+    assert "kitti has no columns for velocity: not written" in caplog.text
+
+
 def test_every_format_has_the_same_boxes(tmp_path):
     detector = small.detector(batch_sizes=(2,))
     frames, keys = small.projections(3), [f"7/0000{i}" for i in range(3)]

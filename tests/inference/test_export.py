@@ -142,17 +142,8 @@ def test_a_program_of_two_frames_takes_the_channels_of_both(tmp_path):
     _check(found, "1", again(frames))
 
 
-def _with_own_output():
-    saved = small.saved(model__outputs={"velocity": 2})
-    model = saved.model
-    shape = (1, *small.small_grid().projection_shape)
-    variables = model.init(jax.random.key(0), np.zeros(shape, np.float32))
-    saved = dataclasses.replace(saved, variables=variables)
-    return Detector(saved, batch_sizes=(2,), score_threshold=0.1)
-
-
 def test_own_outputs_are_results_of_a_program(tmp_path):
-    detector = _with_own_output()
+    detector = small.detector_with_output(batch_sizes=(2,))
     export.export(detector, tmp_path, platforms=("cpu",), batch_size=2)
     rows = json.loads((tmp_path / "outputs.json").read_text())
     (row,) = (row for row in rows if row["name"] == "velocity")
@@ -169,7 +160,7 @@ def test_own_outputs_are_results_of_a_program(tmp_path):
 def test_own_outputs_are_results_of_an_onnx_file(tmp_path):
     pytest.importorskip("jax2onnx")
     pytest.importorskip("onnxruntime")
-    detector = _with_own_output()
+    detector = small.detector_with_output(batch_sizes=(2,))
     export.export(detector, tmp_path, kind="onnx", batch_size=2)
     projection = small.projections(2)
     found = exported_loader.load(tmp_path)(projection)

@@ -124,6 +124,14 @@ def test_matching_weights_are_those_of_equal_name_and_shape(
     )
     assert text in caplog.text
     assert "params/heads/velocity/out" in caplog.text
+    assert "another radar" not in caplog.text
+    bins = {"doppler_bins": options.doppler_bins + 1}
+    bins["elevation_bins"] = options.elevation_bins - 1
+    with caplog.at_level("WARNING", logger="radejax"):
+        matching_weights(tmp_path, models.build(options.replace(**bins)))
+    assert (
+        "the first convolution does not fit: config.model.doppler_bins" in caplog.text
+    )
     stranger = dataclasses.replace(saved, variables={"params": {"other": np.zeros(1)}})
     monkeypatch.setattr(saved_models, "load_model", lambda path: stranger)
     with pytest.raises(

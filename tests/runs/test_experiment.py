@@ -246,7 +246,9 @@ def test_what_a_run_started_from_is_kept(tmp_path: pathlib.Path) -> None:
 
 
 def test_commit_and_own_parts_of_a_run_are_stored(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert experiment.run_info(tmp_path)["commit"] == "not in a repository"
@@ -264,8 +266,14 @@ def test_commit_and_own_parts_of_a_run_are_stored(
     config = Config().replace(loss=weights)
     config.check_imports()
     digest = hashlib.sha256(own.read_bytes()).hexdigest()
-    assert experiment.own_parts(config) == {"own_terms:size": digest}
-    assert experiment.own_parts(Config()) == {}
+    parts = config.own_parts()
+    assert parts == {"own_terms:size": digest}
+    assert Config().own_parts() == {}
+    config.check_parts(parts, tmp_path)
+    assert not caplog.text
+    own.write_text("def size(pairs, options):\n    return 2.0\n")
+    config.check_parts(parts, tmp_path)
+    assert f"{tmp_path}: the file of own_terms:size has changed since" in caplog.text
 
 
 # Several seeds -----------------------------------------------------------------------

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import pytest
 
 from radejax.config import Config
+from radejax.core.errors import UserError
 from radejax.training import hooks, loop
 from radejax.training.metric_writer import MetricWriter
 
@@ -45,6 +46,18 @@ def test_values_that_an_own_hook_returns_are_logged(tmp_path: pathlib.Path) -> N
     (line,) = (tmp_path / "metrics.jsonl").read_text().splitlines()
     row = json.loads(line)
     assert (row["step"], row["norm"]) == (3, 2.5)
+
+
+def test_a_hook_that_returns_something_else_is_named(tmp_path: pathlib.Path) -> None:
+    def wrong(*_: Any) -> Any:
+        return "text"
+
+    with MetricWriter(tmp_path, Config(), 0) as writer:
+        hook = hooks.logged(wrong, writer)
+        with pytest.raises(
+            UserError, match=r"of wrong in config\.train\.hooks is 'text'"
+        ):
+            hook(1, None, {})
 
 
 def test_the_loop_stops_between_steps() -> None:

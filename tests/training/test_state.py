@@ -155,8 +155,13 @@ def test_patterns_freeze_in_addition_to_the_model() -> None:
     assert frozen == {"backbone": {"encoder_1": 1}, "image": {"w": 3}}
     assert merge_parameters(trained, frozen) == params
     assert split_parameters(params, freezing(SimpleNamespace(), ()))[0] == params
+    of_part = freezing(SimpleNamespace(), ("backbone",))
+    assert split_parameters(params, of_part)[0] == {"image": {"w": 3}}
     check_patterns(params, ("backbone/*",))
-    with pytest.raises(UserError, match=r"freeze is 'neck\*', .* in backbone, image, "):
+    with pytest.raises(
+        UserError,
+        match=r"'neck\*', .*: backbone/decoder_1, backbone/encoder_1, image/w$",
+    ):
         check_patterns(params, ("image*", "neck*"))
     with pytest.raises(UserError, match="expected patterns that leave parameters"):
         check_patterns(params, ("*",))
