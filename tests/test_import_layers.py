@@ -116,3 +116,23 @@ def test_commands_load_only_the_libraries_that_they_need() -> None:
     command, root = [sys.executable, "-c", code], PACKAGE.parent
     done = subprocess.run(command, cwd=root, capture_output=True, text=True)
     assert done.stderr.strip() == "set()"
+
+
+def test_importing_changes_neither_logging_nor_signals() -> None:
+    code = (
+        "import importlib, logging, pkgutil, signal, sys\n"
+        "def state():\n"
+        "    logger = logging.root\n"
+        "    signals = [signal.getsignal(x) for x in signal.valid_signals()]\n"
+        "    return logger.handlers[:], logger.level, logger.filters[:], signals\n"
+        "before = state()\n"
+        "import radejax\n"
+        "optional = ('radejax.cli', 'radejax.__main__', 'radejax.visualize.recordings')\n"
+        "for module in pkgutil.walk_packages(radejax.__path__, 'radejax.'):\n"
+        "    if not module.name.startswith(optional):\n"
+        "        importlib.import_module(module.name)\n"
+        "assert {'orbax', 'grain', 'matplotlib'} <= set(sys.modules)\n"
+        "assert state() == before, state()\n"
+    )
+    command = [sys.executable, "-c", code]
+    subprocess.run(command, cwd=PACKAGE.parent, check=True)

@@ -14,12 +14,12 @@ import logging
 import re
 from collections.abc import Iterable, Mapping, Sequence
 
-import grain
 import jax
 import numpy as np
 from jaxtyping import Float, Int, Real
 
 from radejax.core.errors import UserError, require
+from radejax.core.grain_import import grain
 from radejax.core.structures import CLASSES, Array, Batch
 from radejax.core.workers import usable_cpus
 from radejax.data.augment import Augmentation, Sample

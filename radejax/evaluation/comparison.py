@@ -360,13 +360,16 @@ def compare_files(
         The tables as text, and the fields of all comparisons in the order of the runs.
 
     Raises:
-        UserError: There are fewer than two runs or no resamples, the runs have different
-            frames or ground truth, or the sequences of the frames are not known.
+        UserError: There are fewer than two runs, neither resamples nor figures, the runs
+            have different frames or ground truth, or the sequences of the frames are not
+            known.
     """
     if len(paths) < 2:
         raise UserError("a comparison needs at least two runs")
-    if options.bootstrap < 1:
-        raise UserError("--bootstrap=0: a comparison needs 1 resample or more")
+    if options.bootstrap < 1 and not figures:
+        raise UserError(
+            "--bootstrap=0: a comparison needs 1 resample or more, or only --figures"
+        )
     folders = [report_folders(path) for path in paths]
     # Predictions below the lowest stored score of one run must not count for another run.
     seeds = [seed for run in folders for seed in run.values()]
@@ -378,7 +381,7 @@ def compare_files(
     loaded = [(first, frames), *others]
     built = []
     rows = []
-    for i, (sets, _) in enumerate(others, 1):
+    for i, (sets, _) in enumerate(others if options.bootstrap else [], 1):
         found = compare(first, sets, frames, options)
         label = "comparison" if len(others) == 1 else f"comparison-{i}"
         counts = len(first), len(sets)
@@ -386,6 +389,8 @@ def compare_files(
         rows += [report.plain(dataclasses.asdict(row)) for row in found]
     is_simulated = next(iter(first.values())).is_simulated
     text = report.rendered(built, is_simulated=is_simulated)
+    if not built:
+        text = "no table without resamples: --bootstrap is 0\n"
     if out_dir is not None:
         content = {"runs": names, "options": options.to_dict(), "rows": rows}
         place = pathlib.Path(out_dir) / "comparison"

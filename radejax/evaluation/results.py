@@ -313,7 +313,7 @@ def sequence_weights(
     if names.size < 2:
         raise UserError(
             f"intervals need at least 2 sequences to resample, found {names.size}: evaluate "
-            "more, such as --split all"
+            "more, such as --split all, or give --bootstrap 0"
         )
     rng = np.random.default_rng(seed)
     drawn = rng.multinomial(names.size, np.full(names.size, 1 / names.size), resamples)

@@ -9,7 +9,6 @@ import logging
 import time
 from collections.abc import Sequence
 
-import grain
 import jax
 import numpy as np
 import tqdm
@@ -18,6 +17,7 @@ from jaxtyping import UInt8
 
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike
+from radejax.core.grain_import import grain
 from radejax.core.manifest import state_of, warn_of_changes
 from radejax.data.cameras import read_left_image
 from radejax.data.dataset import LabelledFrame

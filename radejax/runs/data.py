@@ -9,7 +9,6 @@ import logging
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-import grain
 import jax
 import numpy as np
 
@@ -17,6 +16,7 @@ from radejax.config import Config, check_bins
 from radejax.core import devices
 from radejax.core.errors import UserError, require
 from radejax.core.files import JsonObject, as_path
+from radejax.core.grain_import import grain
 from radejax.core.options import find_function
 from radejax.core.structures import Batch
 from radejax.data import cameras, pipeline, records

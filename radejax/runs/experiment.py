@@ -29,7 +29,6 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import flax.linen as nn
-import grain
 import jax
 import numpy as np
 from flax.typing import VariableDict
@@ -41,6 +40,7 @@ from radejax.config import Config
 from radejax.core import devices, files
 from radejax.core.errors import UserError, require
 from radejax.core.files import JsonObject, PathLike
+from radejax.core.grain_import import grain
 from radejax.core.options import find_function
 from radejax.core.structures import Batch
 from radejax.core.version import __version__, commit, radejax_commit

@@ -21,16 +21,15 @@ from typing import TYPE_CHECKING, TypeVar
 
 import jax
 import numpy as np
-import orbax.checkpoint as ocp
 from absl import logging as absl_logging
 from jax.experimental import multihost_utils
 from jax.typing import ArrayLike
 from jaxtyping import PyTree
-from orbax.checkpoint import checkpoint_managers as policies
 
 from radejax.core import devices, files
 from radejax.core.errors import DataError, one_line
 from radejax.core.files import JsonObject
+from radejax.core.orbax_import import keep_root_logger, ocp, policies
 from radejax.core.structures import Batch
 
 if TYPE_CHECKING:  # inference reads checkpoints without the data pipeline
@@ -46,14 +45,18 @@ _VARIABLES = ("params", "ema_params", "model_state", "frozen")
 
 @contextlib.contextmanager
 def _without_orbax_log() -> Iterator[None]:
-    """Hides what orbax logs while a block runs, as it raises its errors too."""
+    """Hides what orbax logs while a block runs, as it raises its errors too.
+
+    The root logger is not configured either.
+    """
     log = absl_logging.get_absl_logger()
     if _is_not_of_orbax in log.filters:  # within another block
         yield
         return
     log.addFilter(_is_not_of_orbax)
     try:
-        yield
+        with keep_root_logger():
+            yield
     finally:
         log.removeFilter(_is_not_of_orbax)
 

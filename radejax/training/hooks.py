@@ -15,7 +15,6 @@ import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
-import grain
 import jax
 import numpy as np
 import tqdm
@@ -24,6 +23,7 @@ from jaxtyping import Int
 from radejax.config import Config
 from radejax.core import devices
 from radejax.core.errors import DataError, require
+from radejax.core.grain_import import grain
 from radejax.core.structures import Batch
 from radejax.core.workers import usable_cpus
 from radejax.training.checkpoints import Checkpoints

@@ -7,7 +7,6 @@ import contextlib
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
-import grain
 import jax
 import numpy as np
 from flax.typing import VariableDict
@@ -18,6 +17,7 @@ from jaxtyping import PyTree
 
 from radejax.core import devices, files
 from radejax.core.errors import UserError
+from radejax.core.grain_import import grain
 from radejax.core.structures import Batch
 from radejax.training.checkpoints import Checkpoints
 from radejax.training.hooks import STEPS_IN_FLIGHT, Hook

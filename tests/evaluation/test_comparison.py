@@ -249,6 +249,17 @@ def test_predictions_in_files_are_compared(stored, scene, write_table):
     paths = [folder / "few.json", folder / "found.json"]
     _, rows = compare_files(paths, None, source, OPTIONS)
     assert next(row for row in rows if row["cls"] == "Sedan")["difference"] > 0
+    none = OPTIONS.replace(bootstrap=0)
+    with pytest.raises(UserError, match="needs 1 resample or more, or only --figures"):
+        compare_files(paths, folder / "out", source, none)
+    text, rows_of_none = compare_files(
+        paths, folder / "out", source, none, figures="png"
+    )
+    assert (text, rows_of_none) == (
+        "no table without resamples: --bootstrap is 0\n",
+        [],
+    )
+    assert (folder / "out" / "comparison_3d_iou30.png").exists()
     words = ["compare", *paths, "--bootstrap", 30, "--roi", "none", "--json"]
     words += ["--ground-truth", source.ground_truth]
     words += ["--protocols", "all_point,kradar_r40"]
