@@ -293,14 +293,13 @@ def _levels(power: Real[jax.Array, "*cells"]) -> Float[jax.Array, "*cells"]:
 
 
 def find_invalid(
-    frames: Real[jax.Array, "*B _ _ _"] | Real[jax.Array, "*B D R E A"],
-    *,
-    are_tensors: bool,
-) -> tuple[Bool[jax.Array, "*B"], ...]:
+    frames: Real[jax.Array, "..."], *, are_tensors: bool
+) -> tuple[Bool[jax.Array, "..."], ...]:
     """Finds frames with `PROBLEMS` in JAX; detectors and exported programs use it.
 
     Args:
-        frames: Projections as they are stored, or tensors of linear power.
+        frames: `[..., R, A, D+E]` projections as they are stored, or `[..., D, R, E, A]`
+            tensors of linear power.
         are_tensors: Whether the frames are tensors.
     """
     axes = (-4, -3, -2, -1) if are_tensors else (-3, -2, -1)

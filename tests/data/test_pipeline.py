@@ -396,6 +396,7 @@ def test_targets_and_augmented_samples_come_with_the_batch(records, data):
             assert change.mean() > 0
 
 
+@pytest.mark.wrong_types
 @pytest.mark.parametrize(
     ("change", "message"),
     [

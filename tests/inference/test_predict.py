@@ -2,6 +2,8 @@
 
 from types import SimpleNamespace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -120,8 +122,9 @@ def test_scores_during_training_name_their_protocol(setup):
         setup.records.grid, setup.model, setup.config.data.azimuth_mapping
     )
     expected = []
+    variables = jax.tree.map(jnp.asarray, setup.variables)
     for batch in make_loader(table, one_by_one):
-        maps = setup.model.apply(setup.variables, *batch.model_inputs(), train=False)
+        maps = setup.model.apply(variables, *batch.model_inputs(), train=False)
         terms = detection_loss(maps, batch, grid, setup.config.loss)[1]
         expected.append(
             [float(terms[name]) for name in ("focal", "gwd", "weighted_sum")]

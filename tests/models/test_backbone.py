@@ -34,13 +34,14 @@ class Double(SkipAttention):
 
 
 def test_skips_have_the_attention_of_the_config():
-    x = np.random.default_rng(0).normal(size=(1, 8, 8, 3)).astype(np.float32)
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(1, 8, 8, 3)), jnp.float32)
     own = f"{__name__}:Double"
     found = {}
     for cbam in ("off", own):
         backbone = Backbone(3, (8,), decoder_width=8, num_groups=4, cbam=cbam)
         variables = small.drawn(backbone, x)
         assert "cbam_1" not in variables["params"]
+        variables = jax.tree.map(jnp.asarray, variables)
         found[cbam] = backbone.apply(variables, x)
     assert np.abs(found["off"] - found[own]).max() > 0.1
     with pytest.raises(

@@ -146,6 +146,7 @@ def test_frozen_parameters_have_no_update_and_no_optimizer_state() -> None:
     )
 
 
+@pytest.mark.wrong_types
 def test_patterns_freeze_in_addition_to_the_model() -> None:
     params = {"backbone": {"encoder_1": 1, "decoder_1": 2}, "image": {"w": 3}}
     own = SimpleNamespace(is_frozen=lambda path: path.startswith("image/"))
