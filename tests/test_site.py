@@ -23,6 +23,18 @@ def test_a_site_without_a_public_name_is_rejected(tmp_path: pathlib.Path) -> Non
     assert pages.missing(tmp_path) == names[:1]
 
 
+def test_linked_files_are_in_the_repository() -> None:
+    """Some readers see the pages in the repository, and not on the site."""
+    pages = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")]
+    lost = []
+    for page in pages:
+        links = re.findall(r"\]\(([^)\s#]+)[^)]*\)", page.read_text(encoding="utf-8"))
+        paths = [link for link in links if not re.match(r"[a-z]+:", link)]
+        lost += [f"{page}: {x}" for x in paths if not (page.parent / x).exists()]
+    assert len(pages) > 20
+    assert lost == []
+
+
 def test_every_config_field_is_in_the_reference() -> None:
     text = pages.config_page()
     for config in ("dinorade", "quickstart_fusion"):
