@@ -62,7 +62,10 @@ def _radejax(*arguments: object) -> Result:
 
 
 def _metrics(folder: pathlib.Path) -> dict:
-    return json.loads((folder / "run" / "evaluation" / "metrics.json").read_text())
+    path = folder / "run" / "evaluation" / "metrics.json"
+    metrics: dict = json.loads(path.read_text())
+    del metrics["date"]
+    return metrics
 
 
 @pytest.fixture(scope="module")

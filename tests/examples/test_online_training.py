@@ -69,7 +69,7 @@ def test_training_resumes_with_identical_results(tmp_path, monkeypatch):
     )
     data = simulate_dataset(finer, tmp_path / "finer", progress=False)
     with pytest.raises(
-        UserError, match=r"16 x 64 .*expected 4 x 24 .*model was trained"
+        UserError, match=r"doppler_bins is 4, expected 16, as the radar"
     ):
         evaluate_run(whole, other={"roots": (str(data),)})
     assert not (data / "records").exists()
