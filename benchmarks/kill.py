@@ -110,7 +110,7 @@ def same(folder, a, b):
         for run in (a, b)
     ]
     for values in metrics:
-        values.pop("run")
+        del values["run"], values["date"]
     different += ["metrics"] * (metrics[0] != metrics[1])
     return different
 
