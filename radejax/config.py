@@ -159,7 +159,7 @@ class Config(Options):
         if changed := [name for name, sha in now if before.get(name, sha) != sha]:
             _log.warning(
                 "%s: the file of %s has changed since the training was started: results may "
-                "be others",
+                "differ",
                 run,
                 ", ".join(changed),
             )

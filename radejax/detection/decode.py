@@ -242,8 +242,8 @@ def find_peaks(
         best = jnp.where(_in_roi(maps.box_params, grid, roi), best, 0.0)
     best = best.reshape(best.shape[0], -1)  # [B, R * A]
     top, flat = jax.lax.top_k(best, min(max_peaks, best.shape[1]))
-    classes = jnp.argmax(_rows_at(_flat_bins(scores), flat), -1)  # the first of equals
-    params = _rows_at(_flat_bins(maps.box_params), flat).astype(jnp.float32)
+    classes = jnp.argmax(rows_at(_flat_bins(scores), flat), -1)  # the first of equals
+    params = rows_at(_flat_bins(maps.box_params), flat).astype(jnp.float32)
     bins = jnp.stack([flat // num_azimuth, flat % num_azimuth], -1)
     return Peaks(
         bins=bins,
@@ -252,12 +252,12 @@ def find_peaks(
         classes=classes.astype(jnp.int32),
         is_valid=top > 0,
         num_found=jnp.sum(best > 0, axis=-1, dtype=jnp.int32),
-        outputs={n: _rows_at(_flat_bins(x), flat) for n, x in maps.outputs.items()},
+        outputs={n: rows_at(_flat_bins(x), flat) for n, x in maps.outputs.items()},
     )
 
 
 @jax.vmap
-def _rows_at(
+def rows_at(
     rows: Shaped[jax.Array, "N ..."], indices: Int[jax.Array, " K"]
 ) -> Shaped[jax.Array, "K ..."]:
     """Returns rows of every frame: `[B, N, ...]` at `[B, K]` -> `[B, K, ...]`."""
@@ -294,19 +294,19 @@ def _compact(
 ) -> Detections:
     """Moves the kept peaks to the front, in order, and returns the first K rows."""
     order = jnp.argsort(~keep, axis=-1, stable=True)[:, :max_detections]
-    is_valid = _rows_at(keep, order)
-    boxes = _rows_at(peaks.boxes, order)
+    is_valid = rows_at(keep, order)
+    boxes = rows_at(peaks.boxes, order)
     num_kept = jnp.sum(keep, axis=-1, dtype=jnp.int32)
     num_entered = jnp.sum(peaks.is_valid, axis=-1, dtype=jnp.int32)
     return Detections(
         boxes=jnp.where(is_valid[..., None], boxes7_from_8(boxes), 0.0),
-        scores=jnp.where(is_valid, _rows_at(peaks.scores, order), 0.0),
-        classes=jnp.where(is_valid, _rows_at(peaks.classes, order), -1),
+        scores=jnp.where(is_valid, rows_at(peaks.scores, order), 0.0),
+        classes=jnp.where(is_valid, rows_at(peaks.classes, order), -1),
         is_valid=is_valid,
         num_truncated=peaks.num_found
         - num_entered
         + jnp.maximum(num_kept - max_detections, 0),
-        outputs={name: _rows_at(x, order) for name, x in peaks.outputs.items()},
+        outputs={name: rows_at(x, order) for name, x in peaks.outputs.items()},
     )
 
 

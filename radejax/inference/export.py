@@ -185,7 +185,7 @@ def _radar_shape(detector: Detector, radar_input: str) -> tuple[int, ...]:
 def _jax_versions() -> dict[str, str]:
     """Return the smallest and largest version of JAX that can read a program.
 
-    Older versions than the tested ones may not know operations that newer ones write. JAX
+    Versions older than the tested ones may lack operations that newer ones write. JAX
     reads what was exported six months before, which is about two minor versions.
     """
     version = jax.__version__
@@ -314,7 +314,7 @@ _UNITS = {
     "classes": "index into config.classes, -1 for padding",
     "is_valid": "true for a detection",
     "num_truncated": "number of peaks and boxes that were dropped",
-    "num_invalid": "number of frames that cannot be radar data: no, if 0",
+    "num_invalid": "number of frames that cannot be radar data",
 }
 
 
@@ -414,7 +414,7 @@ def _stablehlo(
 
 
 def _onnx_metadata(detector: Detector) -> dict[str, object]:
-    """Return what a file tells of its model, as JSON by name."""
+    """Return the metadata of the model that an ONNX file contains, by name."""
     return {
         "radejax": __version__,
         "commit": radejax_commit(),

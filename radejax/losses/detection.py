@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int, Num, Shaped
 from radejax.core.errors import require
 from radejax.core.options import NotNegative, Options, Positive, find_function
 from radejax.core.structures import Batch, DetectionMaps
-from radejax.detection.decode import DecodeOptions, find_peaks, suppress
+from radejax.detection.decode import DecodeOptions, find_peaks, rows_at, suppress
 from radejax.detection.nms import match_boxes
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.focal import SigmaMode, focal_loss, gaussian_heatmap
@@ -163,7 +163,7 @@ def detection_loss(
         bins, object_idx, is_matched = _after_nms(
             decoding or DecodeOptions(), maps, boxes, is_valid, grid
         )
-        truth = {name: _rows_at(x, object_idx) for name, x in truth.items()}
+        truth = {name: rows_at(x, object_idx) for name, x in truth.items()}
     expected = truth.pop("boxes")
     predicted = grid.boxes_at(_at_bins(maps.box_params, bins), bins)
     row = is_matched[..., None]
@@ -200,14 +200,6 @@ def _at_bins(
 ) -> Shaped[jax.Array, "K ..."]:
     """Returns the values of every frame at bins: `[B, R, A, ...]` -> `[B, K, ...]`."""
     return values[bins[:, 0], bins[:, 1]]
-
-
-@jax.vmap
-def _rows_at(
-    rows: Shaped[jax.Array, "N ..."], indices: Int[jax.Array, " K"]
-) -> Shaped[jax.Array, "K ..."]:
-    """Returns rows of every frame: `[B, N, ...]` at `[B, K]` -> `[B, K, ...]`."""
-    return rows[indices]
 
 
 # Terms -------------------------------------------------------------------------------

@@ -2,8 +2,8 @@
 
 The layout follows Figure 4 of RADE-Net and Figure 3 of DinoRADE: the radar map with a
 dashed region of interest, ground truth with its class, predictions with class and score,
-and the camera image. Colors distinguish objects that are found and missed, and true and
-false positives, if the scene has matches. In the bird's-eye view, x points up and y to the left, in
+and the camera image. If the scene has matches, colors distinguish objects that are found and
+missed, and true and false positives. In the bird's-eye view, x points up and y to the left, in
 meters, and every range-azimuth bin covers the ground that it measures.
 
 A projection `[R, A, D+E]` consists of two 3D maps: range-azimuth-Doppler (maximum over

@@ -25,9 +25,9 @@ def simulate_adc(
 ) -> Inexact[jax.Array, "D T Q N"]:
     """Simulates the ADC samples of one radar frame. The function is jitted.
 
-    A scatterer keeps its range bin during the frame. Those beyond the ADC's rate are left out,
-    as by an ideal filter. Its signal is scaled so that its peak in
-    the tensor has the power that it has in `tensor.simulate`.
+    A scatterer keeps its range bin during the frame. Scatterers beyond the ADC's rate are left
+    out, as by an ideal filter. The signal of each is scaled so that its peak in the tensor has
+    the power that it has in `tensor.simulate`.
 
     Args:
         scatterers: Point targets, padded with targets of zero amplitude.
