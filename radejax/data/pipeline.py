@@ -183,11 +183,16 @@ def _empty_column(
     frames: FrameSequence, name: str, shape: tuple[int, int]
 ) -> Float[np.ndarray, "F N ..."]:
     """Returns a column of the objects of all frames without known values."""
-    found = [frame.columns[name] for frame in frames if name in frame.columns]
-    known = sorted({name for frame in frames for name in frame.columns})
-    expected = f"a column of the labels: {', '.join(known) or 'they have none'}"
-    require(len(found) > 0, "config.data.targets", name, expected)
-    return np.full((*shape, *found[0].shape[1:]), np.nan, np.float32)
+    columns = {
+        key: column
+        for frame in frames
+        for key, column in frame.columns.items()
+        if column.dtype.kind in "biuf"
+    }
+    known = ", ".join(sorted(columns)) or "they have none"
+    expected = f"a column of numbers of the labels: {known}"
+    require(name in columns, "config.data.targets", name, expected)
+    return np.full((*shape, *columns[name].shape[1:]), np.nan, np.float32)
 
 
 @dataclasses.dataclass(frozen=True)

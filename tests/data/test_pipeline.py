@@ -359,7 +359,11 @@ def test_table_by_hand(written):
 @pytest.mark.wrong_types
 def test_targets_are_columns_of_the_kept_objects(written):
     frames = [
-        frame_of("1/b", [BOX, BOX], ["Bicycle", "Sedan"], v=[[1.0, 2], [3, np.nan]]),
+        frame_of(
+            *("1/b", [BOX, BOX], ["Bicycle", "Sedan"]),
+            v=[[1.0, 2], [3, np.nan]],
+            w=["R", "L"],  # texts are no targets
+        ),
         frame_of("1/a", [BOX], ["Sedan"]),
     ]
     table = make_table(
