@@ -260,7 +260,12 @@ def find_peaks(
 def rows_at(
     rows: Shaped[jax.Array, "N ..."], indices: Int[jax.Array, " K"]
 ) -> Shaped[jax.Array, "K ..."]:
-    """Returns rows of every frame: `[B, N, ...]` at `[B, K]` -> `[B, K, ...]`."""
+    """Returns rows of every frame: `[B, N, ...]` at `[B, K]` -> `[B, K, ...]`.
+
+    Example:
+        >>> rows_at(jnp.array([[5.0, 6.0, 7.0]]), jnp.array([[2, 0]])).tolist()
+        [[7.0, 5.0]]
+    """
     return rows[indices]
 
 
