@@ -295,10 +295,12 @@ def _read_exported(folder: pathlib.Path) -> SavedModel:
         arrays = {name: value.astype(np.float32) for name, value in arrays.items()}
         variables = unflatten_dict(arrays, sep="/")
         config = Config(**content["config"])
-        grid, usual = RadarGrid.from_dict(content["grid"]), content.get("input")
-        identity = content["identity"]
         saved = SavedModel(
-            config, grid, variables, usual_input=usual, identity=identity
+            config,
+            RadarGrid.from_dict(content["grid"]),
+            variables,
+            usual_input=content.get("input"),
+            identity=content["identity"],
         )
         image_backbone.check_fits(saved.model, variables, weights)
         return saved

@@ -208,9 +208,11 @@ def draw_compared(
     for weather, index in fullest_of_weathers(evaluated).items():
         frame = evaluated[index]
         if records:
-            grid, projection = records.grid, decode(records[frame.key])
+            grid = records.grid
+            projection = decode(records[frame.key])
         else:
-            grid, projection = dataset.grid, frame.read_projection(dataset.grid)
+            grid = dataset.grid
+            projection = frame.read_projection(grid)
         suffix = ", simulated" if frame.is_simulated else ""
         scenes = [
             frame_scene(
