@@ -198,6 +198,7 @@ def test_input_unlike_that_of_the_training_is_warned_of_once(
     saved = dataclasses.replace(detector.saved, usual_input=usual)
     path = tmp_path / "tesseract_00001.mat"
     write.write_tesseract(path, 1e4 * tesseracts[0])
+    unused = Detector(saved, batch_sizes=(1, 4)).warmup()
     for frames, is_near in (
         (projections, True),
         (tesseracts[:1], True),
@@ -209,12 +210,12 @@ def test_input_unlike_that_of_the_training_is_warned_of_once(
         (projections.mean() + 3 * (projections - projections.mean()), False),
         (jnp.asarray(projections * 0.3), True),  # those on a device are not checked
     ):
-        made = Detector(saved, batch_sizes=(1, 4)).warmup()
+        made = unused.replace()
         caplog.clear()
         for _ in range(2):
             made(frames)
         assert caplog.text.count("in the training: detections") == (not is_near)
-    made = Detector(saved, batch_sizes=(1, 4))
+    made = unused.replace()
     for frames in (projections, projections, projections, projections + 1):
         made(frames)
     assert "in the training" not in caplog.text  # only the first calls are checked
