@@ -191,9 +191,17 @@ def check_bins(model: RadeNetOptions, grid: RadarGrid, source: str) -> None:
 def load_config(path_and_options: str) -> Config:
     """Loads the config of a file or name such as "my/config.py" or "radenet:stem".
 
+    Args:
+        path_and_options: Path or name as for `config_file`. What follows a colon is passed
+            to the function `get_config` of the file.
+
     Raises:
         UserError: There is no such file, it has no function `get_config` that returns a
             `Config`, or an option is unknown.
+
+    Examples:
+        >>> load_config("radenet:paper").model.cbam
+        'paper'
     """
     name, _, options = path_and_options.partition(":")
     path = config_file(name)

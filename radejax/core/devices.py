@@ -58,12 +58,20 @@ def make_mesh(num_devices: int | None = None) -> Mesh:
 
 
 def replicated(mesh: Mesh) -> NamedSharding:
-    """Returns the sharding of arrays that every device holds completely."""
+    """Returns the sharding of arrays that every device holds completely.
+
+    Args:
+        mesh: Devices, see `make_mesh`.
+    """
     return NamedSharding(mesh, PartitionSpec())
 
 
 def batch_sharding(mesh: Mesh) -> NamedSharding:
-    """Returns the sharding of arrays whose leading axis is the batch."""
+    """Returns the sharding of arrays whose leading axis is the batch.
+
+    Args:
+        mesh: Devices, see `make_mesh`.
+    """
     return NamedSharding(mesh, PartitionSpec(DATA_AXIS))
 
 

@@ -284,14 +284,26 @@ class Boxes:
 
     @classmethod
     def from_columns(cls, columns: Mapping[str, Shaped[np.ndarray, "N ..."]]) -> Boxes:
-        """Creates boxes from the columns that `columns` returns."""
+        """Creates boxes from the columns that `columns` returns.
+
+        Args:
+            columns: "frame", "box", "cls", for predictions "score", and further columns,
+                which become `extras`.
+
+        Raises:
+            DataError: See `Boxes`.
+        """
         extras = dict(columns)
         frame, box, names = (extras.pop(name) for name in ("frame", "box", "cls"))
         return cls(frame, box, names, extras.pop("score", None), extras)
 
     @classmethod
     def concatenate(cls, parts: Sequence[Boxes]) -> Boxes:
-        """Returns the boxes of all parts, of which there is at least one, in their order."""
+        """Returns the boxes of all parts in their order.
+
+        Args:
+            parts: One or more tables with the same columns.
+        """
         tables = [part.columns() for part in parts]
         names = tables[0]
         joined = {n: np.concatenate([table[n] for table in tables]) for n in names}
@@ -311,7 +323,16 @@ class Boxes:
         return smallest <= np.float32(MIN_SIZE_M)
 
     def take(self, rows: Shaped[np.ndarray, " K"]) -> Boxes:
-        """Returns the boxes selected by an array of positions or a boolean mask."""
+        """Returns some of the boxes.
+
+        Args:
+            rows: Positions of the boxes, or a boolean mask of them.
+
+        Examples:
+            >>> boxes = Boxes.one_frame(np.zeros((2, 7)), ["Sedan", "Pedestrian"])
+            >>> boxes.take(boxes.cls == "Sedan").cls.tolist()
+            ['Sedan']
+        """
         return self.from_columns(
             {name: column[rows] for name, column in self.columns().items()}
         )

@@ -111,8 +111,12 @@ def front_view(
 ) -> tuple[UInt8[np.ndarray, "H W 3"] | None, CameraCalibration | None]:
     """Returns the left front image of a frame and its calibration for drawing.
 
-    The image is resized to the image size of the calibration, or to `IMAGE_SIZE` without
-    one. Missing items are None, and both are None without an image.
+    Args:
+        frame: Frame of a dataset.
+
+    Returns:
+        The image, resized to the image size of the calibration, or to `IMAGE_SIZE` without
+        one; and the calibration. Missing items are None, and both are None without an image.
 
     Raises:
         DataError: A file is corrupted.

@@ -128,7 +128,11 @@ class LabelledFrame:
         return f"{self.sequence}/{self.name}"
 
     def with_objects(self, rows: Bool[np.ndarray, " N"]) -> Self:
-        """Returns the frame with only the objects where `rows` is True."""
+        """Returns the frame with some of its objects.
+
+        Args:
+            rows: True for the objects to keep.
+        """
         return dataclasses.replace(
             self,
             boxes=self.boxes[rows],
@@ -137,7 +141,10 @@ class LabelledFrame:
         )
 
     def read_projection(self, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
-        """Reads the radar data and returns their float32 projection on the grid.
+        """Reads the radar data and computes their projection, see `project_tensor`.
+
+        Args:
+            grid: Sensor axes, those of the dataset.
 
         Raises:
             FileNotFoundError: The frame has no radar file.
@@ -148,9 +155,16 @@ class LabelledFrame:
     def read_calibration(
         self, radar_from_lidar_m: tuple[float, ...] | None = None
     ) -> CameraCalibration:
-        """Reads the camera calibration, with the frame's own translation or a given one.
+        """Reads the camera calibration.
 
         It is called only if there is a `camera_calibration_path`.
+
+        Args:
+            radar_from_lidar_m: Translation x, y, z in meters from the LiDAR to the radar
+                frame; that of the frame if None.
+
+        Raises:
+            DataError: The file is corrupted.
         """
         raise NotImplementedError
 
@@ -216,15 +230,27 @@ class LabelledFrames(Sequence[_F]):
             options: The section `config.data`. `sequences` and `weather` are applied
                 afterwards if the reader ignores them.
             classes: Classes to detect. Objects of other classes may be left out.
+
+        Raises:
+            UserError: There are no frames, or an option has an invalid value.
+            DataError: A file is corrupted.
         """
         raise NotImplementedError
 
     @classmethod
     def check_options(cls, options: DataOptions, classes: Sequence[str]) -> None:
-        """Raises `UserError` if the format has no such options or classes."""
+        """Raises `UserError` if the format has no such options or classes.
+
+        Args:
+            options: The section `config.data`.
+            classes: Classes to detect.
+        """
 
     def of_split(self, split: str | None) -> Self:
-        """Returns the frames of a split, such as "train" or "test".
+        """Returns the frames of a split.
+
+        Args:
+            split: Name of the split, such as "train" or "test"; None for all frames.
 
         Raises:
             UserError: There is no such split.
@@ -275,7 +301,12 @@ class LabelledFrames(Sequence[_F]):
     def part(
         self, sequences: Collection[int] | None, weather: Collection[str] | None
     ) -> Self:
-        """Returns the frames of some sequences and weathers; None or empty for all."""
+        """Returns the frames of some sequences and weathers.
+
+        Args:
+            sequences: Sequences of the frames to keep; all if None or empty.
+            weather: Weathers of the frames to keep; all if None or empty.
+        """
         left_out = {
             frame.key
             for frame in self
@@ -292,6 +323,9 @@ class LabelledFrames(Sequence[_F]):
         These are objects of other classes than `classes`, boxes with values that are not
         finite or sizes that are not above 0, and those whose center is outside the field of
         view. The summary counts them.
+
+        Args:
+            classes: Classes to detect.
 
         Raises:
             UserError: Yaws are in degrees, or a column has not one row per box.

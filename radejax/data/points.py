@@ -54,6 +54,9 @@ def cfar_points(
         guard_cells: Number of guard cells on each side of a bin.
         training_cells: Number of training cells on each side, outside the guard cells.
 
+    Returns:
+        The points, by descending power.
+
     References:
         Cell averaging: Richards, Fundamentals of Radar Signal Processing, ch. 6.
     """

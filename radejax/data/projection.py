@@ -366,6 +366,10 @@ def encode(
 
     uint8 stores round(255 p) with p clipped to [0, 1]. p = 0 corresponds to a power of
     0.76, far below the noise of K-Radar, and p = 1 to 2.0e18, far above its echoes.
+
+    Args:
+        projection: Normalized log power p, see `project_tensor`.
+        encoding: One of `ENCODINGS`.
     """
     if encoding == "uint8":
         levels: np.ndarray = np.clip(projection, 0.0, 1.0) * 255.0
@@ -374,7 +378,11 @@ def encode(
 
 
 def decode(stored: Real[np.ndarray, "*axes"]) -> Float[np.ndarray, "*axes"]:
-    """Converts records to float32 projections on the host; inverse of `encode`."""
+    """Converts records to float32 projections on the host; inverse of `encode`.
+
+    Args:
+        stored: Values of records, of any type of `ENCODINGS`.
+    """
     if stored.dtype == np.uint8:
         return stored.astype(np.float32) / np.float32(255.0)
     return stored.astype(np.float32)

@@ -262,6 +262,10 @@ def rows_at(
 ) -> Shaped[jax.Array, "K ..."]:
     """Returns rows of every frame: `[B, N, ...]` at `[B, K]` -> `[B, K, ...]`.
 
+    Args:
+        rows: Rows `[B, N, ...]`.
+        indices: Positions `[B, K]` from 0 to N - 1.
+
     Example:
         >>> rows_at(jnp.array([[5.0, 6.0, 7.0]]), jnp.array([[2, 0]])).tolist()
         [[7.0, 5.0]]

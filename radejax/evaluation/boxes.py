@@ -37,6 +37,9 @@ Roi = str | Sequence[float] | None
 def roi_bounds(roi: Roi) -> tuple[float, ...] | None:
     """Returns the bounds (x0, x1, y0, y1, z0, z1) of a named or given region of interest.
 
+    Args:
+        roi: One of `ROIS`, the bounds in meters in the radar frame, or None.
+
     Raises:
         UserError: The name is unknown, or the bounds are not three increasing pairs.
 
@@ -57,6 +60,10 @@ def roi_bounds(roi: Roi) -> tuple[float, ...] | None:
 
 def in_roi(box: Real[np.ndarray, "N 7"], roi: Roi) -> Bool[np.ndarray, " N"]:
     """Returns a mask of boxes whose centers are inside the region, bounds included.
+
+    Args:
+        box: Boxes x, y, z, l, w, h, yaw in the radar frame.
+        roi: Region in meters, see `roi_bounds`; None contains every box.
 
     Examples:
         >>> cars = np.array([[20.0, 0, 0, 4, 2, 1.5, 0], [20.0, 40, 0, 4, 2, 1.5, 0]])
@@ -173,6 +180,14 @@ def _frame_column(table: AnyColumns, name: str) -> Int[np.ndarray, " N"]:
 def frame_ids(frames: AnyColumns) -> Int[np.ndarray, " F"]:
     """Returns the ids of a frame table, checked to be unique integers.
 
+    Args:
+        frames: Frame table: columns of equal length, of which "frame" has the ids.
+
+    Raises:
+        UserError: The table has no column frame, it is not of integers, or a column has
+            another length.
+        DataError: A frame occurs twice.
+
     Examples:
         >>> frame_ids({"frame": np.array([7, 9])}).tolist()
         [7, 9]
@@ -196,6 +211,11 @@ def class_indices(
     boxes: Boxes, classes: Sequence[str], name: str
 ) -> Int[np.ndarray, " N"]:
     """Returns the index of each box into `classes`, or -1 for K-Radar's other classes.
+
+    Args:
+        boxes: Boxes with class names.
+        classes: Classes that are evaluated.
+        name: Name of the table for the error message.
 
     Raises:
         DataError: A class name is neither evaluated nor one of K-Radar's.
@@ -224,6 +244,11 @@ def frame_positions(
 ) -> Int[np.ndarray, " N"]:
     """Returns the positions of frames in the array `ids`.
 
+    Args:
+        frame: Ids of frames, of which each may occur several times.
+        ids: Ids of all frames.
+        name: Name of the table for the error message.
+
     Raises:
         DataError: A frame is not in `ids`.
 
@@ -244,6 +269,10 @@ def frame_positions(
 
 def take(table: AnyColumns, rows: Shaped[np.ndarray, " K"]) -> Columns:
     """Selects rows of a table by position or mask.
+
+    Args:
+        table: Columns of equal length by name.
+        rows: Positions of the rows, or a boolean mask of them.
 
     Examples:
         >>> table = {"frame": np.array([0, 1, 1]), "cls": np.array(["a", "b", "c"])}

@@ -116,6 +116,9 @@ class Result(Curve):
 def mean_ap(results: Sequence[Curve]) -> float:
     """Computes the mean AP over the classes that occur, or NaN if none does.
 
+    Args:
+        results: Results of the classes; those with a NaN AP do not occur.
+
     Examples:
         >>> mean_ap([])
         nan

@@ -331,7 +331,15 @@ def resample(
     """Computes `[B, C + 1]` APs of every class and their mean in every resample.
 
     The AP is NaN if a resample has no object of the class. The mean is over the classes
-    that occur. `settings` are further arguments of `EvaluationSet.results`.
+    that occur.
+
+    Args:
+        data: Predictions and ground truth.
+        weights: How often each frame counts in each resample, see `sequence_weights`.
+        protocol: One of `protocols.PROTOCOLS`.
+        space: "bev" or "3d".
+        iou: A match needs an IoU above it.
+        **settings: Further arguments of `EvaluationSet.results`.
     """
     settings |= {"iou_thresholds": iou, "spaces": space}
     samples = []
@@ -348,6 +356,10 @@ def in_one_sequence(
 
     Their APs hardly vary when sequences are resampled. The last entry, of the mean, is True
     if this holds for every class that occurs.
+
+    Args:
+        data: Predictions and ground truth.
+        sequence: Sequence of every frame.
     """
     counts = [np.unique(sequence[has]).size for has in data.gt_count.T > 0]
     return np.array([*(count == 1 for count in counts), max(counts) < 2])
@@ -369,6 +381,10 @@ def condition_masks(frames: AnyColumns, kind: str) -> dict[str, Bool[np.ndarray,
     """Returns the mask of frames for each value in a column of the frame table.
 
     K-Radar's weathers come first, in their order.
+
+    Args:
+        frames: Frame table.
+        kind: Name of the column, such as "weather".
     """
     if kind not in frames:
         return {}

@@ -150,6 +150,13 @@ def to_camera(
 ) -> Float[ArrayT, "*points 3"]:
     """Transforms points `[..., 3]` in meters from the ego frame to the camera frame.
 
+    Args:
+        points: Points x (forward), y (left), z (up) in the ego frame.
+        camera: One camera or a batch, see `project`.
+
+    Returns:
+        Points x (right), y (down), z (depth) in meters in the camera frame.
+
     Examples:
         >>> raised = np.column_stack([np.eye(3), [0, 0, 2.0]])
         >>> one = Camera(raised, np.ones(4), np.zeros(5), 9.0, np.ones(2), True)
@@ -170,6 +177,11 @@ def to_pixels(
     points_cam: Float[ArrayT, "*points 3"], camera: Camera, depth_offset_m: float
 ) -> Float[ArrayT, "*points 2"]:
     """Projects points `[..., 3]` of the camera frame to pixels `[..., 2]`; see `project`.
+
+    Args:
+        points_cam: Points in meters, as `to_camera` returns them.
+        camera: One camera or a batch, see `project`.
+        depth_offset_m: Addend of the depth in the division, see `project`.
 
     Examples:
         >>> lens = np.array([100.0, 100, 320, 240])
@@ -329,7 +341,12 @@ class CameraCalibration(ArrayValues):
         return "\n".join(lines) + "\n"
 
     def resized(self, width: int, height: int) -> CameraCalibration:
-        """Returns the calibration of the image after resizing it, without cropping."""
+        """Returns the calibration of the image after resizing it, without cropping.
+
+        Args:
+            width: New width in pixels.
+            height: New height in pixels.
+        """
         scale = np.array([width / self.width, height / self.height] * 2)
         intrinsics = self.intrinsics * scale
         return dataclasses.replace(
@@ -362,6 +379,9 @@ class CameraCalibration(ArrayValues):
             image: "raw" is the image as recorded, with lens distortion; "pinhole" uses the
                 same intrinsics without distortion, as the released DinoRADE does.
             is_valid: False marks a frame without an image.
+
+        Raises:
+            UserError: There is no such kind of image.
         """
         kinds = get_args(ImageKind)
         require(image in kinds, "image", image, f"one of {', '.join(kinds)}")

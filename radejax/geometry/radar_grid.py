@@ -76,6 +76,10 @@ def values_at(axis: Float[np.ndarray, " bins"], position: PositionT) -> Position
 
     They are linear between adjacent centers, and continue with the first and last step.
 
+    Args:
+        axis: Monotonic bin centers.
+        position: Positions in bins, 0 at the first center.
+
     Examples:
         >>> values_at(np.array([1.0, 2.0, 4.0]), np.array([-1.0, 1.5, 3.0])).tolist()
         [0.0, 3.0, 6.0]
@@ -209,6 +213,26 @@ class RadarGrid(ArrayValues):
 
         Range starts at 0, azimuth and elevation are symmetric, and Doppler covers
         `[-max, max)` like the output of an FFT. A single elevation or Doppler is 0.
+
+        Args:
+            num_doppler: Number of Doppler bins.
+            num_range: Number of range bins.
+            num_elevation: Number of elevation bins.
+            num_azimuth: Number of azimuth bins.
+            max_range_m: Last range and maximum range of the field of view.
+            max_azimuth_deg: Last azimuth and maximum azimuth of the field of view.
+            max_elevation_deg: Last elevation.
+            max_doppler_mps: Velocity at which the Doppler axis wraps.
+
+        Raises:
+            UserError: See `RadarGrid`.
+
+        Examples:
+            >>> grid = RadarGrid.reduced(
+            ...     num_doppler=4, num_range=24, num_elevation=3, num_azimuth=16
+            ... )
+            >>> grid.shape_drea
+            (4, 24, 3, 16)
         """
         azimuth = np.deg2rad(max_azimuth_deg)
         elevation = np.deg2rad(max_elevation_deg) if num_elevation > 1 else 0.0
@@ -224,7 +248,15 @@ class RadarGrid(ArrayValues):
 
     @classmethod
     def from_dict(cls, fields: JsonObject) -> RadarGrid:
-        """Creates the grid that `to_dict` has written."""
+        """Creates the grid that `to_dict` has written.
+
+        Args:
+            fields: Values of the fields by name, as in `radar_grid.json`.
+
+        Raises:
+            KeyError: A field is missing.
+            UserError: See `RadarGrid`.
+        """
         return cls(**{f.name: fields[f.name] for f in dataclasses.fields(cls)})
 
     def to_dict(self) -> JsonObject:
@@ -317,7 +349,11 @@ class RadarGrid(ArrayValues):
     def measured_channels(
         self, projection: Float[ArrayT, "*bins DE"]
     ) -> Float[ArrayT, "*bins _"]:
-        """Returns the channels of a tesseract's projection that are not of an empty axis."""
+        """Returns the channels of a tesseract's projection that are not of an empty axis.
+
+        Args:
+            projection: Projection of a tesseract, which has one bin on an empty axis.
+        """
         shape = self.shape_drea
         if self.projection_shape[2] == shape[0] + shape[2]:
             return projection
@@ -355,6 +391,10 @@ class RadarGrid(ArrayValues):
     ) -> Float[ArrayT, "*bins 2"]:
         """Returns the fractional bins of ground positions, as the inverse of `bin_to_ego`.
 
+        Args:
+            x_m: Forward positions `[...]` in the ego frame.
+            y_m: Left positions `[...]` in the ego frame.
+
         Returns:
             `[..., 2]` range and azimuth in bins, not clipped to the grid.
         """
@@ -386,6 +426,10 @@ class RadarGrid(ArrayValues):
         """Returns the integer bins nearest to ground positions, clipped to the grid.
 
         Halves are rounded to even, as in the released ground-truth encoding.
+
+        Args:
+            x_m: Forward positions `[...]` in the ego frame.
+            y_m: Left positions `[...]` in the ego frame.
 
         Returns:
             `[..., 2]` int32 range and azimuth indices.
@@ -438,6 +482,10 @@ class RadarGrid(ArrayValues):
     def check_maps(self, heatmap: Array, box_params: Array) -> None:
         """Raises `ValueError` if the shapes of a detector's maps do not match the grid.
 
+        Args:
+            heatmap: Map that should be `[B, R, A, C]`.
+            box_params: Map that should be `[B, R, A, 8]`.
+
         Examples:
             >>> maps = jnp.zeros((1, 256, 107, 5)), jnp.zeros((1, 256, 107, 8))
             >>> RadarGrid.kradar().check_maps(*maps)
@@ -455,7 +503,12 @@ class RadarGrid(ArrayValues):
     def in_field_of_view(
         self, x_m: Real[ArrayT, "*#bins"], y_m: Real[ArrayT, "*#bins"]
     ) -> Bool[ArrayT, "*bins"]:
-        """Returns True for positions within the azimuth and range of the field of view."""
+        """Returns True for positions within the azimuth and range of the field of view.
+
+        Args:
+            x_m: Forward positions `[...]` in the ego frame.
+            y_m: Left positions `[...]` in the ego frame.
+        """
         xp, (x_m, y_m) = as_floats(x_m, y_m)
         is_ahead = xp.abs(xp.arctan2(y_m, x_m)) <= self.fov_azimuth_rad
         is_near = xp.sqrt(x_m * x_m + y_m * y_m) <= self.fov_range_m

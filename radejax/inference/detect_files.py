@@ -188,6 +188,9 @@ def find_inputs(
             revision that the run was trained with if None.
         camera_calibration: Folder of camera calibrations; that of the run if None.
 
+    Returns:
+        The frames, with their images for a radar-camera model, for `detect_files`.
+
     Raises:
         FileNotFoundError: A path does not exist.
         UserError: There is no frame, two frames would be written to the same file, or a

@@ -113,8 +113,10 @@ class Detector:
 
     Examples:
         >>> detector = Detector.from_workdir("runs/quickstart")  # doctest: +SKIP
+        >>> projection = project_file("tesseract_00033.mat")  # doctest: +SKIP
         >>> detector(projection).to_list()  # doctest: +SKIP
-        >>> fusion(projection, images, calibration)  # doctest: +SKIP
+        >>> fusion = Detector.from_workdir("runs/quickstart_fusion")  # doctest: +SKIP
+        >>> fusion(projection, ["cam-front_00001.png"], "cam_front0.yml")  # doctest: +SKIP
     """
 
     def __init__(
@@ -193,6 +195,8 @@ class Detector:
 
         Raises:
             FileNotFoundError: There is no model, or no such checkpoint.
+            UserError: An option or the image backbone does not fit the model.
+            DataError: A file is corrupted.
         """
         saved = load_model(path, step=step, image_backbone=image_backbone)
         return cls(saved, **options)
@@ -211,6 +215,11 @@ class Detector:
             path_or_state_dict: File, or mapping of names to arrays, see `load_torch`.
             image_backbone: Folder of DINOv3, for DinoRADE files without its weights.
             **options: Keyword arguments of `Detector`.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            UserError: The file needs weights of DINOv3, or an option is wrong.
+            DataError: The file is corrupted, or of another network.
         """
         saved = load_torch(path_or_state_dict, image_backbone=image_backbone)
         return cls(saved, **options)
@@ -224,6 +233,10 @@ class Detector:
         """Return a copy with other variables or batch sizes that shares compiled programs.
 
         The counters of the copy start at zero.
+
+        Args:
+            variables: Variables of the same shapes; those of this detector if None.
+            batch_sizes: Batch sizes as for `Detector`; those of this detector if None.
         """
         other = copy.copy(self)
         other._lock = threading.Lock()
@@ -410,6 +423,12 @@ class Detector:
             frames: Items that `__call__` of a model of one frame accepts as `frames`, or
                 tuples of the frames, image and camera of an item.
             **settings: Keyword arguments of `__call__`.
+
+        Yields:
+            Detections of one item, on the device.
+
+        Raises:
+            UserError: As `__call__`.
         """
         started: list[Detections] = []
         history = None
@@ -465,6 +484,12 @@ class Detector:
         NumPy arrays need care: on CPU, `device_put` shares aligned memory regardless of
         `may_alias`, so the array is copied first; on other platforms the transfer is
         asynchronous, so the call waits for it.
+
+        Args:
+            x: The rows of this process.
+
+        Returns:
+            The rows of all processes, as the sharding places them.
         """
         placed: jax.Array
         is_cpu = jax.default_backend() == "cpu"

@@ -64,7 +64,16 @@ def check_jax(found: str, versions: Mapping[str, str]) -> None:
 
 
 def stablehlo(config: dict[str, Any], data: dict[str, bytes], device: Any) -> Run:
-    """Returns the program for JAX, with its weights on a device."""
+    """Returns the program for JAX, with its weights on a device.
+
+    Args:
+        config: Content of config.json.
+        data: Contents of the files by name.
+        device: Device of JAX; its default if None.
+
+    Raises:
+        ImportError: The version of JAX is too old for the program.
+    """
     import jax
     import jax.export  # not a part of `import jax`
 
@@ -83,7 +92,12 @@ def stablehlo(config: dict[str, Any], data: dict[str, bytes], device: Any) -> Ru
 
 
 def onnx(data: dict[str, bytes], session_options: Any) -> Run:
-    """Returns the program for ONNX Runtime."""
+    """Returns the program for ONNX Runtime.
+
+    Args:
+        data: Contents of the files by name.
+        session_options: `SessionOptions` of ONNX Runtime, or None.
+    """
     import onnxruntime
 
     session = onnxruntime.InferenceSession(data["detector.onnx"], session_options)
@@ -111,6 +125,11 @@ def load(
         folder: The folder.
         device: Device of JAX; its default if None.
         session_options: `SessionOptions` of ONNX Runtime, such as its number of threads.
+
+    Raises:
+        FileNotFoundError: A file is missing.
+        ValueError: The folder has another format or no program, or a file is corrupted.
+        ImportError: The version of JAX is too old for the program.
     """
     folder = pathlib.Path(folder).expanduser()
     config, data = read_folder(folder)

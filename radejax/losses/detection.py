@@ -281,6 +281,9 @@ def smooth_l1(difference: Float[jax.Array, "*batch"]) -> Float[jax.Array, "*batc
     `optax.huber_loss` has the same values, but computes gradients as (x - 1) + 1, which
     loses precision for small differences.
 
+    Args:
+        difference: Predicted minus expected values.
+
     Examples:
         >>> smooth_l1(jnp.array([0.5, 3.0])).tolist()
         [0.125, 2.5]

@@ -139,6 +139,10 @@ def focal_loss_per_bin(logits: Bins, target: Bins) -> Bins:
     log p and log(1 - p) are computed from the logits, because log(1 - sigmoid(x)) rounds to
     0 or -inf in float32 where log_sigmoid(-x) is accurate.
 
+    Args:
+        logits: Logits of the heatmap.
+        target: Target heatmap in [0, 1]; bins with 1 are positive.
+
     Examples:
         >>> loss = focal_loss_per_bin(jnp.zeros(3), jnp.array([1.0, 0.0, 0.5]))
         >>> [round(value, 4) for value in loss.tolist()]

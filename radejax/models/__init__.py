@@ -64,7 +64,11 @@ def _model_class(name: str) -> type[RadeNet]:
 
 
 def has_camera(model: nn.Module) -> typing.TypeGuard[DinoRade]:
-    """Returns whether a model takes images."""
+    """Returns whether a model takes images.
+
+    Args:
+        model: Detector, as `build` creates it.
+    """
     return isinstance(model, DinoRade)
 
 
@@ -72,6 +76,9 @@ def external_parts(model: nn.Module) -> tuple[str, ...]:
     """Returns the parts whose frozen parameters are in a file of their own.
 
     Checkpoints do not contain them.
+
+    Args:
+        model: Detector, as `build` creates it.
     """
     is_external = has_camera(model) and model.options.image.freeze
     return (IMAGE_BACKBONE,) if is_external else ()

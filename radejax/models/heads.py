@@ -92,7 +92,15 @@ class Head(layers.Part):
     initial_bias: float = 0.0
 
     def convolve(self, x: Features, widths: Sequence[int]) -> Features:
-        """Applies `ConvGNSiLU` blocks of the given widths and a 1x1 convolution in float32."""
+        """Applies `ConvGNSiLU` blocks and a 1x1 convolution in float32.
+
+        Args:
+            x: Features `[B, R, A, C]`.
+            widths: Channels of the blocks.
+
+        Returns:
+            The output `[B, R, A, features]`.
+        """
         block = nn.remat(ConvGNSiLU) if self.remat else ConvGNSiLU
         for i, width in enumerate(widths, 1):
             x = block(width, self.num_groups, dtype=self.dtype, name=f"conv_{i}")(x)

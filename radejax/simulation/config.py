@@ -209,7 +209,11 @@ class SimulationOptions(Options, section="config.simulation"):
         require(holds, f"config.simulation.{name}", getattr(self, name), expected)
 
     def make_grid(self) -> RadarGrid:
-        """Returns the axes of the radar tensor."""
+        """Returns the axes of the radar tensor.
+
+        Raises:
+            UserError: `grid` describes no grid, or its Doppler bins are not uniform.
+        """
         if isinstance(self.grid, str):
             return RadarGrid.kradar()
         make = RadarGrid if isinstance(self.grid, AxesGrid) else RadarGrid.reduced

@@ -83,6 +83,9 @@ def read_metrics(path: files.PathLike) -> dict[str, tuple[np.ndarray, np.ndarray
 
     An incomplete last line of an interrupted run is ignored.
 
+    Args:
+        path: The file.
+
     Raises:
         FileNotFoundError: The file does not exist.
         DataError: A line is not a JSON object with a step; the message names file and

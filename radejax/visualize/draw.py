@@ -202,8 +202,16 @@ def _outlines_in_polar(
 def draw_frame(scene: Scene) -> Figure:
     """Draw one frame: bird's-eye view, polar view and, if given, camera image.
 
+    Args:
+        scene: Frame to draw; `frame_scene` creates that of a dataset's frame.
+
     Returns:
         A figure of 12 by 6.4 inches; write it with `save_figure`.
+
+    Examples:
+        >>> grid = RadarGrid.kradar()
+        >>> draw_frame(Scene(np.zeros(grid.projection_shape), grid)).get_size_inches()
+        array([12. ,  6.4])
     """
     figure = style.new_figure(12.0, 6.4)
     bev_ax = figure.add_axes((0.05, 0.085, 0.40, 0.835))

@@ -619,7 +619,12 @@ class KRadar(LabelledFrames[Frame]):
 
     @classmethod
     def from_options(cls, options: DataOptions, classes: Sequence[str]) -> KRadar:
-        """Reads all frames of `config.data`, with the objects of the classes."""
+        """Reads all frames of `config.data`; see `KRadar` for errors.
+
+        Args:
+            options: The section `config.data`.
+            classes: Classes of the objects to read.
+        """
         return cls(
             options.roots,
             options.labels,
@@ -635,7 +640,12 @@ class KRadar(LabelledFrames[Frame]):
 
     @classmethod
     def check_options(cls, options: DataOptions, classes: Sequence[str]) -> None:
-        """Raises `UserError` if a label version, flag, weather or class is unknown."""
+        """Raises `UserError` if a label version, flag, weather or class is unknown.
+
+        Args:
+            options: The section `config.data`.
+            classes: Classes to detect.
+        """
         version = options.label_version
         is_version = f"v{version.removeprefix('v')}" in VERSIONS
         expected = f"one of {', '.join(VERSIONS)}"
@@ -650,6 +660,9 @@ class KRadar(LabelledFrames[Frame]):
 
         Label files that were read before are not read again.
 
+        Args:
+            split: "train" or "test", the path of a split file, or None for every frame.
+
         Raises:
             UserError: There is no such split.
             DataError: The split file is malformed.
@@ -658,7 +671,11 @@ class KRadar(LabelledFrames[Frame]):
         return self._with(frames, summary)
 
     def with_valid_boxes(self, classes: Collection[str]) -> KRadar:
-        """Returns the dataset itself, whose boxes were checked and selected when read."""
+        """Returns the dataset itself, whose boxes were checked and selected when read.
+
+        Args:
+            classes: Ignored; those of the dataset were given when it was read.
+        """
         return self
 
     def class_counts(self) -> dict[str, int]:
@@ -668,6 +685,9 @@ class KRadar(LabelledFrames[Frame]):
 
     def lidar_path(self, frame: Frame) -> pathlib.Path:
         """Returns the file of a frame's OS2-64 LiDAR scan.
+
+        Args:
+            frame: Frame of this dataset.
 
         Raises:
             FileNotFoundError: No root has it.

@@ -68,11 +68,23 @@ def read_tesseract(
 def project_file(
     path: PathLike, *, shape_drea: tuple[int, ...] | None = None
 ) -> Float[np.ndarray, "R A DE"]:
-    """Compute `project_tensor` of a file; see `read_tesseract` for arguments and errors.
+    """Compute `project_tensor` of a file.
 
-    Values that cannot be power are a `DataError` too. Uncompressed floats are streamed:
-    every azimuth is reduced while it is in the cache, and the 260 MB are never in memory. (A
-    memory map would save as much, but a bad disk sector would then kill the process.)
+    Uncompressed floats are streamed: every azimuth is reduced while it is in the cache, and
+    the 260 MB are never in memory. (A memory map would save as much, but a bad disk sector
+    would then kill the process.)
+
+    Args:
+        path: `tesseract_*.mat` with the variable `arrDREA`, linear power.
+        shape_drea: Expected shape, or None to accept any four axes.
+
+    Returns:
+        The float32 projection, see `project_tensor`.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        DataError: The file is truncated or corrupted, has no real `arrDREA` of the shape, or
+            has values that cannot be power.
     """
     with _opened(path, shape_drea) as (file, layout):
         if layout.deflated is None and layout.dtype.kind == "f":
