@@ -4,7 +4,8 @@ The layout follows Figure 4 of RADE-Net and Figure 3 of DinoRADE: the radar map 
 dashed region of interest, ground truth with its class, predictions with class and score,
 and the camera image. If the scene has matches, colors distinguish objects that are found and
 missed, and true and false positives. In the bird's-eye view, x points up and y to the left, in
-meters, and every range-azimuth bin covers the ground that it measures.
+meters, and every range-azimuth bin covers the ground that it measures. In the figure of several
+scenes, x points to the right and y up.
 
 A projection `[R, A, D+E]` consists of two 3D maps: range-azimuth-Doppler (maximum over
 elevation) and range-azimuth-elevation (maximum over Doppler). The Doppler axis wraps
@@ -43,9 +44,12 @@ _OUTSIDE_COLOR = "0.90"
 _BEHIND_M = 2.0  # shown behind the sensor, so that its mark is whole
 _POINTS_PER_EDGE = 8  # straight edges bend in the polar view
 _SCENE_PERCENTILES = (20.0, 99.5)
-_FOOT_IN = 0.8  # legend and color bar below scenes
-_IMAGE_IN = 2.25  # image above a map
-_COLUMN_IN, _ROW_IN = 4.9, 8.0  # large enough for scores of crowded scenes
+_FOOT_IN = 1.3  # axis labels, legend and color bar below scenes
+_IMAGE_IN = 3.2  # width of the image to the left of a map
+_MAP_IN, _ROW_IN = 5.5, 2.4  # width of a map, height of a row
+_SCENE_LABEL_PT = (
+    8.5  # legible when a page shows the figure at three quarters of its size
+)
 
 
 def draw_map(
@@ -56,6 +60,7 @@ def draw_map(
     extent: Extent | None = None,
     color_limits: tuple[float, float] | None = None,
     label: str = "",
+    is_sideways: bool = False,
 ) -> Axes:
     """Draw a range-azimuth map, such as a heatmap or attention, on the ground plane.
 
@@ -66,6 +71,7 @@ def draw_map(
         extent: Extent of the ground to show; the field of view by default.
         color_limits: Limits of the color scale; computed from the shown values by default.
         label: Label of the color bar, which is only drawn if this is not empty.
+        is_sideways: Whether x points to the right and y up, instead of up and to the left.
 
     Raises:
         UserError: Map and grid differ in shape.
@@ -90,9 +96,15 @@ def draw_map(
     edges = grid.bin_to_ego(range_bin[:, None], azimuth_bin[None])  # [R'+1, A+1, 2]
     ax.set_facecolor(_OUTSIDE_COLOR)
     shown = values[first:last]
-    mesh = style.draw_tiles(ax, edges[..., 1], edges[..., 0], shown, color_limits)
-    # The y axis increases to the left, as in a view from above with x pointing up.
-    ax.set(xlim=(y1, y0), ylim=(x0, x1), xlabel="y, left [m]", ylabel="x, ahead [m]")
+    ahead, left = edges[..., 0], edges[..., 1]
+    horizontal, vertical = (ahead, left) if is_sideways else (left, ahead)
+    mesh = style.draw_tiles(ax, horizontal, vertical, shown, color_limits)
+    names = "x, ahead [m]", "y, left [m]"
+    if is_sideways:
+        ax.set(xlim=(x0, x1), ylim=(y0, y1), xlabel=names[0], ylabel=names[1])
+    else:
+        # The y axis increases to the left, as in a view from above with x pointing up.
+        ax.set(xlim=(y1, y0), ylim=(x0, x1), xlabel=names[1], ylabel=names[0])
     ax.set_aspect("equal")
     if label:
         # An inset has the height of the axes even if the equal aspect shrinks them.
@@ -149,15 +161,20 @@ def draw_bev(scene: Scene, *, color_limits: tuple[float, float] | None = None) -
     return ax
 
 
-def _draw_ground(scene: Scene, **options: Any) -> Axes:
+def _draw_ground(scene: Scene, is_sideways: bool = False, **options: Any) -> Axes:
     """Draw map, region, boxes and sensor; `options` are passed to `draw_map`."""
-    extent = _extent_m(scene.grid, scene.roi)
-    ax = draw_map(scene.power, scene.grid, extent=extent, **options)
+    extent = _extent_m(scene.grid, scene.roi, 0.2 if is_sideways else 0.37)
+    ax = draw_map(
+        scene.power, scene.grid, extent=extent, is_sideways=is_sideways, **options
+    )
+    order = slice(None) if is_sideways else slice(None, None, -1)
     if scene.lidar_m is not None:
-        style.draw_points(ax, scene.lidar_m[:, 1::-1])
-    _draw_over(ax, scene, lambda points: points[..., ::-1])
+        style.draw_points(ax, scene.lidar_m[:, :2][:, order])
+    label_pt = _SCENE_LABEL_PT if is_sideways else style.LABEL_PT
+    _draw_over(ax, scene, lambda points: points[..., order], label_pt=label_pt)
     # The sensor is drawn as a triangle that points ahead.
-    ax.plot([0.0], [0.0], "^", color="black", mec="white", ms=8, zorder=7)
+    marker = ">" if is_sideways else "^"
+    ax.plot([0.0], [0.0], marker, color="black", mec="white", ms=8, zorder=7)
     return ax
 
 
@@ -176,14 +193,16 @@ def to_polar(points: Float[np.ndarray, "*points 2"]) -> Float[np.ndarray, "*poin
     return polar
 
 
-def _draw_polar(ax: Axes, scene: Scene, *, show_labels: bool) -> None:
+def _draw_polar(
+    ax: Axes, scene: Scene, color_limits: tuple[float, float], *, show_labels: bool
+) -> None:
     """Draw one frame in the network's coordinates, range over azimuth, one tile per bin.
 
     The straight edges of boxes are curves in these coordinates.
     """
     horizontal = bin_edges(np.rad2deg(scene.grid.azimuth_rad))
     vertical = bin_edges(scene.grid.range_m)
-    style.draw_tiles(ax, horizontal, vertical, scene.power)
+    style.draw_tiles(ax, horizontal, vertical, scene.power, color_limits)
     ax.set_xlim(horizontal.min(), horizontal.max())
     ax.set_ylim(max(vertical[0], 0.0), vertical[-1])
     ax.set(xlabel="azimuth, right positive [deg]", ylabel="range [m]")
@@ -216,10 +235,12 @@ def draw_frame(scene: Scene) -> Figure:
     figure = style.new_figure(12.0, 6.4)
     bev_ax = figure.add_axes((0.05, 0.085, 0.40, 0.835))
     _draw_ground(scene, ax=bev_ax, label=POWER_LABEL)
+    # The color bar of the bird's-eye view holds for both maps.
+    limits = bev_ax.collections[0].get_clim()
     has_image = scene.image is not None
     height = 0.26 if has_image else 0.77
     polar_ax = figure.add_axes((0.57, 0.085, 0.41, height))
-    _draw_polar(polar_ax, scene, show_labels=not has_image)
+    _draw_polar(polar_ax, scene, limits, show_labels=not has_image)
     if has_image:
         _draw_view(figure.add_axes((0.53, 0.43, 0.45, 0.49)), scene)
     place = (0.75, 0.095 + height)
@@ -228,53 +249,55 @@ def draw_frame(scene: Scene) -> Figure:
     return figure
 
 
-def draw_scenes(scenes: Sequence[Scene]) -> Figure:
-    """Draw scenes, four per row, each with its camera image above its map.
+def draw_scenes(
+    scenes: Sequence[Scene], *, color_limits: tuple[float, float] | None = None
+) -> Figure:
+    """Draw scenes, one per row, each with its camera image to the left of its map.
 
     Args:
         scenes: One or more scenes. The legend is that of the scene with most kinds of boxes.
+        color_limits: Limits of the color scale that all scenes share; computed from the scenes
+            by default.
     """
-    columns = min(4, len(scenes))
-    width = _COLUMN_IN * columns
     has_image = any(scene.image is not None for scene in scenes)
-    row_in = _ROW_IN if has_image else _ROW_IN - _IMAGE_IN
+    start_in = _IMAGE_IN if has_image else 0.0
+    width = start_in + _MAP_IN + 0.9
     # The legend is above the color bar if both do not fit next to each other.
-    foot_in = _FOOT_IN if columns > 2 else 2 * _FOOT_IN
-    height = row_in * -(-len(scenes) // columns) + foot_in
+    foot_in = _FOOT_IN if has_image else _FOOT_IN + 0.6
+    height = _ROW_IN * len(scenes) + foot_in
     figure = style.new_figure(width, height)
     # All scenes share one color scale. The few strongest echoes are beyond its limits.
-    values = [scene.power.ravel() for scene in scenes]
-    low, high = np.nanpercentile(np.concatenate(values), _SCENE_PERCENTILES)
+    values = np.concatenate([scene.power.ravel() for scene in scenes])
+    low, high = color_limits or np.nanpercentile(values, _SCENE_PERCENTILES)
     limits = (float(low), float(max(high, low + 1e-3)))
-    across = 0.83 / columns
-    for index, scene in enumerate(scenes):
-        row, column = divmod(index, columns)
-        left = (column + 0.14) / columns
-        base = height - row_in * (row + 1) - 0.05  # inches
-        above = None
+    tall = (_ROW_IN - 0.3) / height
+    for row, scene in enumerate(scenes, 1):
+        base = (height - _ROW_IN * row) / height
         if scene.image is not None:
-            place = (left, (base + 5.55) / height, across, 2.15 / height)
-            above = figure.add_axes(place)
+            place = (0.1 / width, base, (_IMAGE_IN - 0.1) / width, tall)
             # Labels are only drawn on the map, as they would hide the small image.
-            _draw_view(above, scene, show_labels=False)
-        below = figure.add_axes((left, (base + 0.55) / height, across, 4.9 / height))
-        _draw_ground(scene, ax=below, color_limits=limits)
-        if column:
-            below.set_ylabel("")
-        (above or below).set_title(scene.title, fontsize=11)
-    place = (1 - 3.3 / width, 0.42 / height, 2.7 / width, 0.11 / height)
+            _draw_view(figure.add_axes(place), scene, show_labels=False)
+        place = ((start_in + 0.75) / width, base, _MAP_IN / width, tall)
+        ax = figure.add_axes(place)
+        _draw_ground(scene, ax=ax, color_limits=limits, is_sideways=True)
+        ax.set_title(scene.title, fontsize=11)
+        if row < len(scenes):
+            ax.set_xlabel("")
+            ax.tick_params(labelbottom=False)
+    place = (1 - 3.1 / width, 0.5 / height, 2.8 / width, 0.12 / height)
     cax = figure.add_axes(place)
     colors = ScalarMappable(Normalize(*limits), style.COLOR_MAP)
     bar = figure.colorbar(colors, cax=cax, orientation="horizontal", extend="both")
-    bar.set_label(POWER_LABEL, fontsize=8)
-    bar.ax.tick_params(labelsize=8)
+    bar.set_label(POWER_LABEL, fontsize=8.5)
+    bar.ax.tick_params(labelsize=8.5)
     _add_legend(
         figure,
         max(scenes, key=lambda scene: len(scene.sets)),
         show_counts=False,
         loc="lower left",
-        bbox_to_anchor=(0.3 / width, (foot_in - _FOOT_IN + 0.2) / height),
-        ncols=4 if columns > 1 else 2,
+        bbox_to_anchor=(0.1 / width, (foot_in - _FOOT_IN + 0.1) / height),
+        ncols=3,
+        fontsize=_SCENE_LABEL_PT,
     )
     return figure
 
@@ -302,8 +325,9 @@ def draw_samples(
     )
     for row, (frame, scene, target) in zip(axes, samples, strict=True):
         for ax, shown in zip(row, (frame, scene), strict=False):
-            _draw_ground(shown, ax=ax)
-        draw_map(target, grid, ax=row[2], extent=_extent_m(scene.grid, scene.roi))
+            _draw_ground(shown, ax=ax, label="normalized log power")
+        extent = _extent_m(scene.grid, scene.roi)
+        draw_map(target, grid, ax=row[2], extent=extent, label="target")
         titles = frame.title, scene.title, "target heatmap, max over classes"
         for ax, title in zip(row, titles, strict=False):
             ax.set_title(title, fontsize=9)
@@ -334,8 +358,13 @@ def _draw_view(ax: Axes, scene: Scene, *, show_labels: bool = True) -> None:
     )
 
 
-def _extent_m(grid: RadarGrid, roi: Sequence[float] | None) -> Extent:
-    """Return the extent of the region and its surroundings, or of the field of view."""
+def _extent_m(
+    grid: RadarGrid, roi: Sequence[float] | None, narrowest: float = 0.37
+) -> Extent:
+    """Return the extent of the region and its surroundings, or of the field of view.
+
+    Narrow regions are widened: half of their width is at least `narrowest` of their length.
+    """
     far = bin_edges(grid.range_m)[-1]
     side = far * np.sin(min(grid.fov_azimuth_rad, np.pi / 2))
     behind = min(far * np.cos(grid.fov_azimuth_rad), -_BEHIND_M)
@@ -343,8 +372,7 @@ def _extent_m(grid: RadarGrid, roi: Sequence[float] | None) -> Extent:
         return behind, far, -side, side
     _, x1, y0, y1 = roi[:4]
     far = min(far, 1.08 * x1)
-    # Narrow regions are widened to an aspect ratio of about 3:4 to be readable.
-    half = max(min(max(-y0, y1, 0.0) * 1.25, side), 0.37 * far)
+    half = max(min(max(-y0, y1, 0.0) * 1.25, side), narrowest * far)
     return -_BEHIND_M, far, -half, half
 
 
@@ -363,6 +391,7 @@ def _draw_over(
     scene: Scene,
     to_axes: Callable[[np.ndarray], np.ndarray],
     show_labels: bool = True,
+    label_pt: float = style.LABEL_PT,
 ) -> None:
     """Draw the region of interest, the boxes with their headings, and labels.
 
@@ -371,6 +400,7 @@ def _draw_over(
         scene: The frame.
         to_axes: Function that converts ground positions `[..., 2]` to data coordinates.
         show_labels: Whether to write class and score next to the boxes.
+        label_pt: Font size of the labels.
     """
     ax.apply_aspect()
     if scene.roi is not None:
@@ -400,7 +430,7 @@ def _draw_over(
             for outline, text in zip(outlines, style.label_texts(boxes), strict=True)
         ]
     if show_labels:
-        style.draw_labels(ax, labels)
+        style.draw_labels(ax, labels, label_pt)
 
 
 def _heading_marks(boxes: Float[np.ndarray, "N 7"]) -> Float[np.ndarray, "N 2 2"]:
@@ -442,8 +472,8 @@ def _add_legend(
     if terms:
         handles.append(Line2D([], [], ls="", label=", ".join(terms)))
     # Counts, threshold and region fit in these sizes.
-    place |= {"fontsize": 7.5, "handlelength": 1.6, "columnspacing": 1.2}
-    owner.legend(handles=handles, frameon=False, **place)
+    sizes = {"fontsize": style.LABEL_PT, "handlelength": 1.6, "columnspacing": 1.2}
+    owner.legend(handles=handles, frameon=False, **sizes | place)
 
 
 # Slices -------------------------------------------------------------------------------

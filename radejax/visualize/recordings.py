@@ -20,10 +20,21 @@ from PIL import Image
 from radejax.core.errors import UserError
 from radejax.core.files import PathLike, as_path, atomic_path
 from radejax.geometry.radar_grid import RadarGrid
+from radejax.visualize import style
 from radejax.visualize.style import COLOR_MAP, Scene, color_limits_of, label_texts
 
 if TYPE_CHECKING:
     import rerun
+
+
+_STYLES = (
+    style.GROUND_TRUTH,
+    style.PREDICTION,
+    style.MISSED,
+    style.TRUE_POSITIVE,
+    style.NOT_EVALUATED,
+)
+_LINE_COLORS = sorted({look.color for look in _STYLES})
 
 
 def animate(
@@ -53,11 +64,11 @@ def animate(
     if first is None:
         raise UserError("no frames to animate")
     with atomic_path(path) as temporary:
-        first.save(
+        _to_palette(first).save(
             temporary,
             "gif",
             save_all=True,
-            append_images=(image.resize(first.size) for image in images),
+            append_images=(_to_palette(image.resize(first.size)) for image in images),
             duration=1000.0 / frames_per_second,
             loop=0,
         )
@@ -69,6 +80,20 @@ def _image_of(figure: Figure) -> Image.Image:
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+
+
+def _to_palette(image: Image.Image) -> Image.Image:
+    """Reduce an image to 256 colors, among them those of boxes.
+
+    A palette of the most frequent colors would lack them, as their lines are thin. The edges of
+    lines and texts have darker shades of them.
+    """
+    rgb = np.array([to_rgb(color) for color in _LINE_COLORS])
+    colors = np.round(255 * np.concatenate([rgb, 0.75 * rgb, 0.5 * rgb])).astype(int)
+    others = image.quantize(256 - len(colors)).getpalette() or []
+    palette = Image.new("P", (1, 1))
+    palette.putpalette((colors.ravel().tolist() + others)[: 3 * 256])
+    return image.quantize(palette=palette, dither=Image.Dither.NONE)
 
 
 def write_recording(scenes: Iterable[Scene], path: PathLike) -> None:
@@ -142,9 +167,9 @@ def _log_scene(stream: rerun.RecordingStream, scene: Scene, index: int) -> None:
     stream.log("world/bev", mesh)
     if scene.image is not None:
         stream.log("camera", rr.Image(np.asarray(scene.image)))
-    for style, boxes in scene.sets:
-        name = style.name.replace(" ", "_")
-        color = [round(255 * value) for value in to_rgb(style.color)]
+    for look, boxes in scene.sets:
+        name = look.name.replace(" ", "_")
+        color = [round(255 * value) for value in to_rgb(look.color)]
         drawn = rr.Boxes3D(
             centers=boxes.box[:, :3],
             half_sizes=boxes.box[:, 3:6] / 2,

@@ -267,6 +267,7 @@ def halo(width: float, color: str = "black") -> list[AbstractPathEffect]:
 
 # Texts next to boxes -----------------------------------------------------------------
 
+LABEL_PT = 7.5
 _LINE_HEIGHT = 1.25  # in units of the font size
 _SIDES = {"left": (-1, 0), "right": (1, 0), "above": (0, 1), "below": (0, -1)}
 
@@ -287,7 +288,7 @@ class Label(NamedTuple):
     side: str
 
 
-def draw_labels(ax: Axes, labels: Sequence[Label], font_size: float = 7.5) -> None:
+def draw_labels(ax: Axes, labels: Sequence[Label], font_size: float = LABEL_PT) -> None:
     """Write each text next to its outline, at a side where it covers no other text.
 
     Among these sides, the one where it covers the fewest outlines is used, and the

@@ -35,6 +35,17 @@ def test_gif_has_every_frame_in_order(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.gif"]
 
 
+def test_gif_keeps_the_colors_of_thin_lines(tmp_path):
+    colors = np.random.default_rng(0).integers(0, 256, (40, 50, 3), np.uint8)
+    colors[20, 10:14] = 255, 127, 110
+    figure = color_figure("white")
+    figure.figimage(colors)
+    path = recordings.animate([figure], tmp_path / "a.gif")
+    with Image.open(path) as gif:
+        shown = np.asarray(gif.convert("RGB"))
+    assert (shown == (255, 127, 110)).all(-1).sum() >= 4
+
+
 @pytest.mark.parametrize(
     ("frames", "name", "message"),
     [([], "a.gif", "no frames"), (["white"], "a.mp4", r"as \.gif")],
