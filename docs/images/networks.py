@@ -1,15 +1,12 @@
 """Draws both networks with the shapes that their modules take and return.
 
-    python docs/images/networks.py
-
-writes docs/images/radenet.png and docs/images/dinorade.png. Shapes, channels and numbers of
-parameters are read from the models of configs/radenet.py and configs/dinorade.py while they
-are traced (`flax.linen.intercept_methods`); only the positions are written here.
+Shapes, channels and numbers of parameters are read from the models of configs/radenet.py and
+configs/dinorade.py while they are traced (`flax.linen.intercept_methods`); only the positions are
+written here.
 """
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import math
 import pathlib
@@ -19,7 +16,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import numpy as np
-from sheet import Block, Point, Sheet
+from sheet import Block, Sheet
 
 from radejax import models
 from radejax.config import load_config
@@ -27,13 +24,15 @@ from radejax.data.cameras import no_images
 from radejax.geometry.radar_grid import RadarGrid
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
+# White text has a contrast of at least 4.5:1 on each.
 DATA, RADAR, ATTENTION, CAMERA, HEADS = (
     "#4C566A",
-    "#2F7F86",
-    "#B58A2B",
+    "#2A767D",
+    "#85621A",
     "#A84A5B",
     "#3E6990",
 )
+COLUMNS = (89.0, 280.0, 470.0, 661.0)  # centers in a page of 750 pixels
 
 
 # Shapes of the models -----------------------------------------------------------------
@@ -96,9 +95,9 @@ class Network:
         """Shape of what a part returns."""
         return _size(self.calls[name][1].shape)
 
-    def count(self, name: str) -> str:
-        """Parameters of a part in millions."""
-        return f"{self.parameters[name] / 1e6:.2f} M parameters"
+    def count(self, *names: str) -> str:
+        """Parameters of some parts in millions."""
+        return f"{sum(self.parameters[name] for name in names) / 1e6:.1f} M"
 
     @property
     def num_levels(self) -> int:
@@ -115,121 +114,105 @@ def _size(shape: Sequence[int]) -> str:
 
 
 def radenet(net: Network) -> Sheet:
-    """Encoder down the left, skips through CBAM, decoder up the right, neck, heads."""
-    sheet = Sheet(15.0, 6.9)
-    levels = net.num_levels
-    rows = [5.6 - 1.35 * level for level in range(levels + 1)]
-    x_encoder, x_cbam, x_decoder = 5.0, 7.15, 9.3
-    options = net.model.options
-    doppler, elevation = options.doppler_bins, options.elevation_bins
-    grid = RadarGrid.kradar()
-    tesseract = sheet.block(
-        1.05, rows[0], 1.7, 1.0, title="4D radar tensor", color=DATA,
-        lines=(_size((0, *grid.shape_drea)), "Doppler, range,", "elevation, azimuth"),
+    """Encoder down the left, skips through CBAM, decoder up, neck and heads on the right."""
+    sheet = Sheet(
+        750, 546, "RADE-Net: a radar tensor passes two projections, an encoder, skip "
+        "connections with CBAM, a decoder, a neck and two heads, and becomes detections."
+    )  # fmt: skip
+    options, grid = net.model.options, RadarGrid.kradar()
+    rows = [232.0 + 92.0 * level for level in range(net.num_levels + 1)]
+    x_encoder, x_cbam, x_decoder, x_heads = COLUMNS
+    tensor = sheet.block(
+        x_encoder, 38, title="4D radar tensor", color=DATA,
+        lines=(_size((0, *grid.shape_drea)), "Doppler, range, elev., az."),
     )  # fmt: skip
     projection = sheet.block(
-        2.95, rows[0], 1.6, 1.0, title="Projection", color=DATA,
+        x_encoder, 128, title="Projections", color=DATA, height=82,
         lines=(
             _size(net.inputs[0].shape),
-            f"max over elevation: {doppler}",
-            f"max over Doppler: {elevation}",
+            f"{options.doppler_bins}: max over elevation",
+            f"{options.elevation_bins}: max over Doppler",
         ),
     )  # fmt: skip
-    sheet.arrow(tesseract.right, projection.left)
-    before, start = projection.right, "backbone/start"
-    first = [f"padded {net.taken('backbone')}"]
-    first += [f"{net.kinds[start]} to {net.given(start)}"] if start in net.calls else []
-    encoders = []
+    sheet.arrow(tensor.bottom, projection.top)
+    before, encoders = projection, []
     for level, y in enumerate(rows[:-1], 1):
         name = f"backbone/encoder_{level}"
-        lines = [*(first if level == 1 else ()), net.given(name)]
-        size = 1.75, 0.95 if level == 1 else 0.62
-        block = sheet.block(
-            x_encoder, y, *size, title=f"Encoder {level}", lines=lines, color=RADAR
-        )
-        if level == 1:
-            sheet.arrow(before, block.left)
-        else:
-            sheet.arrow(encoders[-1].bottom, block.top)
-        encoders.append(block)
+        lines = [f"padded {net.taken('backbone')}"] if level == 1 else []
+        encoder = sheet.block(
+            x_encoder, y, title=f"Encoder {level}", color=RADAR,
+            lines=[*lines, f"to {net.given(name)}"],
+        )  # fmt: skip
+        sheet.arrow(before.bottom, encoder.top)
+        encoders.append(encoder)
+        before = encoder
     last = max(n for n in net.calls if n.startswith("backbone/bottleneck_"))
     bottleneck = sheet.block(
-        x_cbam, rows[-1], 1.9, 0.62, title="Bottleneck", lines=[net.given(last)],
-        color=RADAR,
-    )  # fmt: skip
-    corner = (x_encoder, rows[-1])
-    sheet.arrow(encoders[-1].bottom, corner, bottleneck.left)
-    sheet.notes.append((x_encoder + 0.1, rows[-1] + 0.48, "max pooling 2 × 2"))
-    before, way = bottleneck.right, [(x_decoder, rows[-1])]
-    for number in range(1, levels + 1):
-        y, skip = rows[levels - number], encoders[levels - number]
+        x_cbam, rows[-1], title="Bottleneck", lines=[net.given(last)], color=RADAR
+    )
+    sheet.arrow(before.bottom, (x_encoder, rows[-1]), bottleneck.left)
+    below, way = bottleneck.right, [(x_decoder, rows[-1])]
+    for number in range(1, net.num_levels + 1):
+        y, skip = rows[net.num_levels - number], encoders[net.num_levels - number]
+        name = f"backbone/decoder_{number}"
         decoder = sheet.block(
-            x_decoder, y, 1.75, 0.8, title=f"Decoder {number}", color=RADAR,
-            lines=(
-                f"from {net.taken(f'backbone/decoder_{number}')}",
-                f"to {net.given(f'backbone/decoder_{number}')}",
-            ),
+            x_decoder, y, title=f"Decoder {number}", color=RADAR,
+            lines=(f"from {net.taken(name)}", f"to {net.given(name)}"),
         )  # fmt: skip
         if f"backbone/cbam_{number}" in net.calls:
             cbam = sheet.block(
-                x_cbam, y, 1.7, 0.62, title="CBAM", color=ATTENTION,
-                lines=["channel and spatial"],
-            )  # fmt: skip
+                x_cbam, y, title="CBAM", color=ATTENTION, lines=["channel and spatial"]
+            )
             sheet.arrow(skip.right, cbam.left)
             sheet.arrow(cbam.right, decoder.left)
         else:
             sheet.arrow(skip.right, decoder.left)
-        sheet.arrow(before, *way, decoder.bottom)
-        before, way = decoder.top, []
-    sheet.notes.append((x_decoder + 0.1, rows[-1] + 0.48, "upsampling 2 × 2"))
-    _neck_and_heads(sheet, net, decoder.right, x=11.35, y=rows[0])
-    sheet.notes.append(
-        (
-            0.2,
-            0.55,
-            f"Backbone {net.count('backbone')}, neck {net.count('neck')}, heads "
-            f"{net.count('heads')}. Shapes: range × azimuth × channels, from "
-            "configs/radenet.py.\nEncoder, bottleneck and decoder: two 3 × 3 "
-            "convolutions with group normalization and SiLU, and a residual.",
-        )
-    )
+        sheet.arrow(below, *way, decoder.bottom)
+        below, way = decoder.top, []
+    neck = _neck_and_heads(sheet, net, rows[0])
+    sheet.arrow(decoder.right, neck.left)
+    sheet.block(
+        (x_cbam + x_heads) / 2, 83, width=549, height=156, color=DATA,
+        title=f"RADE-Net: {net.count(*net.parameters)} parameters, all trained",
+        lines=(
+            f"backbone {net.count('backbone')}, neck {net.count('neck')}, "
+            f"heads {net.count('heads')}",
+            "",
+            "Shapes: range × azimuth × channels, of configs/radenet.py.",
+            "Encoder, bottleneck, decoder: two 3 × 3 convolutions with group",
+            "normalization and SiLU, and a residual.",
+            "Max pooling 2 × 2 between encoders, upsampling 2 × 2 before decoders.",
+        ),
+    )  # fmt: skip
     return sheet
 
 
-def _neck_and_heads(
-    sheet: Sheet, net: Network, start: Point, *, x: float, y: float
-) -> None:
-    """Neck, heads and decoding, which both networks share."""
-    blocks = [n for n in net.calls if n.startswith("neck/block_")]
+def _neck_and_heads(sheet: Sheet, net: Network, y: float) -> Block:
+    """Neck, heads and decoding, which both networks share, downwards; returns the neck."""
+    x = COLUMNS[-1]
+    num_blocks = sum(name.startswith("neck/block_") for name in net.calls)
     neck = sheet.block(
-        x, y, 1.55, 0.95, title="Neck", color=RADAR,
-        lines=(f"{len(blocks)} dilated residual", "blocks", net.given("neck")),
+        x, y, title="Neck", color=RADAR,
+        lines=(f"{num_blocks} dilated residual blocks", net.given("neck")),
     )  # fmt: skip
-    sheet.arrow(start, neck.left)
     maps = net.calls["heads"][1]
-    heads = [
-        ("Heatmap", maps.heatmap_logits, 0),
-        ("Box parameters", maps.box_params, 1),
-    ]
-    found = sheet.block(
-        x + 2.35, y - 2.7, 1.6, 0.8, title="Detections", color=DATA,
-        lines=("3 × 3 peaks,", "rotated NMS"),
-    )  # fmt: skip
     bins = _size(net.inputs[0].shape[:3])
     cropped = [f"cropped to {bins}"] if net.model.options.crop_output else []
-    for title, shape, row in heads:
-        y_head = y - 1.35 * row
-        head = sheet.block(
-            x + 2.35, y_head, 1.6, 0.8, title=title, color=HEADS,
-            lines=[_size(shape.shape), *cropped],
-        )  # fmt: skip
-        fork = x + 1.15
-        sheet.arrow(neck.right, (fork, y), (fork, y_head), head.left)
-        if row:
-            sheet.arrow(head.bottom, found.top)
-        else:
-            side = x + 3.4
-            sheet.arrow(head.right, (side, y_head), (side, found.y), found.right)
+    heads = sheet.block(
+        x, y + 100, title="Heads", color=HEADS, height=82,
+        lines=(
+            f"heatmap {_size(maps.heatmap_logits.shape)}",
+            f"boxes {_size(maps.box_params.shape)}",
+            *cropped,
+        ),
+    )  # fmt: skip
+    found = sheet.block(
+        x, y + 200, title="Detections", color=DATA,
+        lines=("3 × 3 peaks,", "rotated NMS"),
+    )  # fmt: skip
+    sheet.arrow(neck.bottom, heads.top)
+    sheet.arrow(heads.bottom, found.top)
+    return neck
 
 
 # DinoRADE ----------------------------------------------------------------------------
@@ -237,112 +220,123 @@ def _neck_and_heads(
 
 def dinorade(net: Network) -> Sheet:
     """Radar branch above, camera branch below, deformable attention between them."""
-    sheet = Sheet(16.4, 6.9)
-    top, middle, low = 5.85, 3.85, 1.75
-    padded = net.taken("backbone")
+    sheet = Sheet(
+        750, 520, "DinoRADE: radar queries sample the features of a frozen image backbone "
+        "by deformable attention, and a gate mixes the result with the radar features."
+    )  # fmt: skip
+    top, middle, low, bottom = 48.0, 150.0, 250.0, 350.0
+    left, second, third, right = COLUMNS
     projection = sheet.block(
-        1.05, top, 1.7, 0.8, title="Projection", color=DATA,
-        lines=(_size(net.inputs[0].shape), f"padded {padded}"),
+        left, top, title="Projections", color=DATA,
+        lines=(_size(net.inputs[0].shape), f"padded {net.taken('backbone')}"),
     )  # fmt: skip
     backbone = sheet.block(
-        3.45, top, 1.85, 0.95, title="Backbone", color=RADAR,
-        lines=("RADE-Net's, dual stem", net.given("backbone"), net.count("backbone")),
+        second, top, title="Backbone", color=RADAR, height=82,
+        lines=(
+            "RADE-Net's, two stems",
+            net.given("backbone"),
+            f"{net.count('backbone')} parameters",
+        ),
     )  # fmt: skip
     radar_neck = sheet.block(
-        5.85, top, 1.75, 0.62, title="Radar neck", color=RADAR,
+        third, top, title="Radar neck", color=RADAR,
         lines=[net.given("image_fusion/radar_neck")],
     )  # fmt: skip
     sheet.arrow(projection.right, backbone.left)
     sheet.arrow(backbone.right, radar_neck.left)
     weighting = sheet.block(
-        3.45, middle, 1.85, 0.8, title="Elevation weights", color=ATTENTION,
+        second, middle, title="Elevation weights", color=ATTENTION,
         lines=(
             f"from {net.taken('image_fusion/weighting')}",
             f"to {net.given('image_fusion/weighting')}",
         ),
     )  # fmt: skip
-    sheet.arrow(projection.bottom, (projection.x, middle), weighting.left)
-    rows = net.calls["image_fusion"][0][3].is_valid.shape
+    sheet.arrow(projection.bottom, (left, middle), weighting.left)
+    queries = _size(net.calls["image_fusion"][0][3].is_valid.shape)
+    calibration = sheet.block(
+        left, low, title="Calibration", color=DATA, lines=["of each sequence"]
+    )
     points = sheet.block(
-        3.45, 2.6, 1.85, 0.8, title="Reference points", color=CAMERA,
-        lines=(_size(rows), "from the calibration"),
+        second, low, title="Reference points", color=CAMERA,
+        lines=(queries, "in the image"),
     )  # fmt: skip
-    camera = sheet.block(
-        1.05, 2.6, 1.7, 0.62, title="Calibration", color=DATA,
-        lines=["of each sequence"],
-    )  # fmt: skip
-    sheet.arrow(camera.right, points.left)
+    sheet.arrow(calibration.right, points.left)
     image = sheet.block(
-        1.05, 1.3, 1.7, 0.62, title="Image", lines=[_size(net.inputs[1].shape)],
-        color=DATA,
-    )  # fmt: skip
+        left, bottom, title="Image", lines=[_size(net.inputs[1].shape)], color=DATA
+    )
+    is_frozen = net.model.options.image.freeze
     vit = sheet.block(
-        3.45, 1.3, 1.85, 0.95, title="ViT, frozen", color=CAMERA,
+        second, bottom, title="DINOv3 ViT-S", color=CAMERA, height=82,
+        is_frozen=is_frozen,
         lines=(
-            "DINOv3 ViT-S/16",
+            "frozen" if is_frozen else "trained",
             f"patches {net.taken('image_neck')}",
-            net.count("image_backbone"),
+            f"{net.count('image_backbone')} parameters",
         ),
     )  # fmt: skip
     neck = sheet.block(
-        5.85, 1.3, 1.75, 0.95, title="Camera neck", color=CAMERA,
-        lines=("two upsampling stages", net.given("image_neck"), net.count("image_neck")),
+        third, bottom, title="Camera neck", color=CAMERA, height=82,
+        lines=(
+            "two upsampling stages",
+            net.given("image_neck"),
+            f"{net.count('image_neck')} parameters",
+        ),
     )  # fmt: skip
     dilated = sheet.block(
-        5.85, 2.6, 1.75, 0.8, title="Dilated neck", color=CAMERA,
-        lines=("before the attention", net.given("image_fusion/camera_neck")),
+        third, low, title="Dilated neck", color=CAMERA,
+        lines=(net.given("image_fusion/camera_neck"),),
     )  # fmt: skip
     sheet.arrow(image.right, vit.left)
     sheet.arrow(vit.right, neck.left)
     sheet.arrow(neck.top, dilated.bottom)
-    return _fusion(
-        sheet, net, radar_neck, weighting, points, dilated, (top, middle, low)
-    )
-
-
-def _fusion(
-    sheet: Sheet,
-    net: Network,
-    radar: Block,
-    weighting: Block,
-    points: Block,
-    camera: Block,
-    rows: tuple[float, float, float],
-) -> Sheet:
-    """From queries and camera map to detections."""
-    top, middle, _ = rows
     fusion = net.model.options.fusion
     attention = sheet.block(
-        8.35, middle, 2.0, 1.15, title="Deformable attention", color=ATTENTION,
+        third, middle, title="Deformable attention", color=ATTENTION, height=82,
         lines=(
-            f"{_size(net.calls['image_fusion'][0][3].is_valid.shape)} queries",
+            f"{queries} queries",
             f"{fusion.num_heads} heads, {fusion.num_points} points each",
             "mean over elevation",
         ),
     )  # fmt: skip
+    sheet.arrow(radar_neck.bottom, attention.top)
     sheet.arrow(weighting.right, attention.left)
-    between = points.y + 0.62
-    sheet.arrow(points.top, (points.x, between), (7.0, between), (7.0, middle - 0.25),
-                (attention.left[0], middle - 0.25))  # fmt: skip
-    sheet.arrow(camera.right, (attention.x, camera.y), attention.bottom)
-    sheet.arrow(radar.right, (attention.x - 0.3, top), (attention.x - 0.3, top - 0.3),
-                (attention.x - 0.3, attention.top[1]))  # fmt: skip
+    sheet.arrow(dilated.top, attention.bottom)
+    between = (second + third) / 2
+    entry = middle + 26
+    sheet.arrow(
+        points.right, (between, low), (between, entry), (attention.left[0], entry)
+    )
     gate = sheet.block(
-        10.75, top, 1.7, 0.95, title="Gate", color=ATTENTION,
+        right, top, title="Gate", color=ATTENTION, height=82,
         lines=("weight of the camera", "per bin and channel", net.given("image_fusion")),
     )  # fmt: skip
-    sheet.arrow((attention.x - 0.3, top), gate.left)
-    sheet.arrow(attention.right, (gate.x, middle), gate.bottom)
-    _neck_and_heads(sheet, net, gate.right, x=12.75, y=top)
-    sheet.notes.append(
-        (
-            6.95,
-            0.75,
-            f"Fusion {net.count('image_fusion')}, neck {net.count('neck')}, heads "
-            f"{net.count('heads')}.\nShapes: range × azimuth (× elevation) × channels; "
-            "camera: height × width × channels;\nfrom configs/dinorade.py.",
-        )
+    sheet.arrow(radar_neck.right, gate.left)
+    between = (third + right) / 2
+    entry = top + 26
+    sheet.arrow(
+        attention.right, (between, middle), (between, entry), (gate.left[0], entry)
     )
+    head_neck = _neck_and_heads(sheet, net, middle)
+    sheet.arrow(gate.bottom, head_neck.top)
+    return _totals(sheet, net)
+
+
+def _totals(sheet: Sheet, net: Network) -> Sheet:
+    """Add the numbers of trained and frozen parameters below DinoRADE."""
+    frozen = ["image_backbone"] if net.model.options.image.freeze else []
+    trained = [name for name in net.parameters if name not in frozen]
+    total = f"DinoRADE: {net.count(*trained)} parameters trained"
+    sheet.block(
+        375, 460, width=740, height=96, color=DATA,
+        title=total + (f", {net.count(*frozen)} frozen" if frozen else ""),
+        lines=(
+            f"of the trained: backbone {net.count('backbone')}, fusion "
+            f"{net.count('image_fusion')}, camera neck {net.count('image_neck')},",
+            f"neck {net.count('neck')}, heads {net.count('heads')}",
+            "Shapes: range × azimuth (× elevation) × channels; camera: height × width × "
+            "channels; of configs/dinorade.py.",
+        ),
+    )  # fmt: skip
     return sheet
 
 
@@ -352,14 +346,8 @@ SHEETS = {
 }
 
 
-def main() -> None:
-    """Draw both figures."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--out", type=pathlib.Path, default=ROOT / "docs" / "images")
-    out = parser.parse_args().out
+def draw(out: pathlib.Path) -> None:
+    """Write radenet.svg and dinorade.svg into a folder."""
     for name, (config, lay_out) in SHEETS.items():
-        lay_out(Network.of(config)).draw().savefig(out / f"{name}.png")
-
-
-if __name__ == "__main__":
-    main()
+        text = lay_out(Network.of(config)).svg()
+        (out / f"{name}.svg").write_text(text, encoding="utf-8")

@@ -1,29 +1,48 @@
-"""Blocks, arrows and notes on a page, of which the figures of the networks consist."""
+"""Blocks and arrows as an SVG file, of which the figures of the networks consist.
+
+All text is white on a block of its own color and the page is transparent, so that the figures can
+be read on a bright and on a dark page, whichever of them a site shows.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from xml.sax.saxutils import escape
 
-from matplotlib.figure import Figure
-from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
-
-INK, PALE = "#22262E", "#5A6270"
 Point = tuple[float, float]
+
+ARROW_COLOR = "#848d97"  # at least 3:1 on white and on black
+_STYLE = f"""
+text {{ font: 12px system-ui, "Segoe UI", Helvetica, Arial, "DejaVu Sans", sans-serif; fill: #fff }}
+text.title {{ font-weight: bold; font-size: 13px }}
+text.center {{ text-anchor: middle }}
+polyline {{ fill: none; stroke: {ARROW_COLOR}; stroke-width: 1.8 }}
+"""
+_MARKER = (
+    '<marker id="tip" viewBox="0 0 10 10" refX="9" refY="5" markerWidth="8" '
+    'markerHeight="8" orient="auto" markerUnits="userSpaceOnUse">'
+    f'<path d="M0 0 10 5 0 10z" fill="{ARROW_COLOR}"/></marker>'
+)
+_LOCK = (
+    '<path transform="translate({x:g} {y:g})" fill="none" stroke="#fff" stroke-width="1.6" '
+    'd="M0 6h10v7h-10zM2 6v-3a3 3 0 0 1 6 0v3"/>'
+)
+_LINE_HEIGHT = 15.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Block:
-    """A block with a title and smaller lines below it; x and y are its center."""
+    """A block with a title and lines below it; x and y are its center, y points down."""
 
     x: float
     y: float
     width: float
     height: float
     title: str
+    color: str
     lines: Sequence[str] = ()
-    color: str = PALE
+    is_frozen: bool = False
 
     @property
     def left(self) -> Point:
@@ -35,75 +54,72 @@ class Block:
 
     @property
     def top(self) -> Point:
-        return self.x, self.y + self.height / 2
+        return self.x, self.y - self.height / 2
 
     @property
     def bottom(self) -> Point:
-        return self.x, self.y - self.height / 2
+        return self.x, self.y + self.height / 2
+
+    def svg(self) -> str:
+        """Return the elements of the block."""
+        x, y = self.left[0], self.top[1]
+        dashes = f' stroke="{ARROW_COLOR}" stroke-width="3" stroke-dasharray="6 3"'
+        dashes = dashes if self.is_frozen else ""
+        parts = [
+            f'<rect x="{x:g}" y="{y:g}" width="{self.width:g}" height="{self.height:g}" '
+            f'rx="6" fill="{self.color}"{dashes}/>'
+        ]
+        base = self.y + 4 - _LINE_HEIGHT * len(self.lines) / 2
+        for number, line in enumerate((self.title, *self.lines)):
+            name = "center" if number else "center title"
+            place = f'x="{self.x:g}" y="{base + number * _LINE_HEIGHT:g}"'
+            parts.append(f'<text class="{name}" {place}>{escape(line)}</text>')
+        if self.is_frozen:
+            parts.append(_LOCK.format(x=x + self.width - 18, y=y + 7))
+        return "\n".join(parts)
 
 
 @dataclasses.dataclass
 class Sheet:
-    """Blocks, arrows and notes of one figure, in inches."""
+    """Blocks and arrows of one figure, in pixels of a page of this width."""
 
     width: float
     height: float
+    description: str
     blocks: list[Block] = dataclasses.field(default_factory=list)
-    arrows: list[tuple[list[Point], str]] = dataclasses.field(default_factory=list)
-    notes: list[tuple[float, float, str]] = dataclasses.field(default_factory=list)
+    arrows: list[Sequence[Point]] = dataclasses.field(default_factory=list)
 
-    def block(self, *place: float, title: str, color: str, lines: Any = ()) -> Block:
-        """Add a block; `place` is x, y, width, height."""
-        made = Block(*place, title, tuple(lines), color)
+    def block(
+        self,
+        x: float,
+        y: float,
+        *,
+        title: str,
+        color: str,
+        lines: Sequence[str] = (),
+        width: float = 168.0,
+        height: float = 66.0,
+        is_frozen: bool = False,
+    ) -> Block:
+        """Add a block."""
+        made = Block(x, y, width, height, title, color, tuple(lines), is_frozen)
         self.blocks.append(made)
         return made
 
-    def arrow(self, *way: Point, color: str = PALE) -> None:
+    def arrow(self, *way: Point) -> None:
         """Add an arrow along points."""
-        self.arrows.append((list(way), color))
+        self.arrows.append(way)
 
-    def draw(self) -> Figure:
-        """Return the figure."""
-        figure = Figure(figsize=(self.width, self.height), dpi=150, facecolor="white")
-        axes = figure.add_axes(
-            (0, 0, 1, 1), xlim=(0, self.width), ylim=(0, self.height)
-        )
-        axes.axis("off")
-        for way, color in self.arrows:
-            axes.plot(*zip(*way[:-1], strict=True), color=color, lw=1.2, zorder=1)
-            tip = FancyArrowPatch(
-                *way[-2:],
-                arrowstyle="-|>",
-                mutation_scale=9,
-                shrinkA=0,
-                shrinkB=0,
-                color=color,
-                lw=1.2,
-                zorder=1,
-            )
-            axes.add_patch(tip)
-        for block in self.blocks:
-            _draw_block(axes, block)
-        for x, y, text in self.notes:
-            axes.text(x, y, text, size=8.5, color=PALE, va="center", linespacing=1.5)
-        return figure
-
-
-def _draw_block(axes: Any, block: Block) -> None:
-    frame = FancyBboxPatch(
-        (block.x - block.width / 2, block.y - block.height / 2),
-        block.width,
-        block.height,
-        boxstyle="round,pad=0,rounding_size=0.06",
-        facecolor="white",
-        edgecolor=block.color,
-        linewidth=1.4,
-        zorder=2,
-    )
-    axes.add_patch(frame)
-    rise = 0.165
-    y = block.y + rise * len(block.lines) / 2
-    place = {"ha": "center", "va": "center", "zorder": 3}
-    axes.text(block.x, y, block.title, size=9, weight="bold", color=INK, **place)
-    for number, line in enumerate(block.lines, 1):
-        axes.text(block.x, y - rise * number, line, size=7.5, color=PALE, **place)
+    def svg(self) -> str:
+        """Return the figure as an SVG document."""
+        size = f'viewBox="0 0 {self.width:g} {self.height:g}" width="{self.width:g}"'
+        lines = [
+            f'<svg xmlns="http://www.w3.org/2000/svg" {size} role="img">',
+            f"<title>{escape(self.description)}</title>",
+            f"<style>{_STYLE}</style><defs>{_MARKER}</defs>",
+        ]
+        for way in self.arrows:
+            points = " ".join(f"{x:g},{y:g}" for x, y in way)
+            lines.append(f'<polyline points="{points}" marker-end="url(#tip)"/>')
+        lines += [block.svg() for block in self.blocks]
+        return "\n".join((*lines, "</svg>", ""))
