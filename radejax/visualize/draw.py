@@ -284,7 +284,7 @@ def draw_scenes(
         if row < len(scenes):
             ax.set_xlabel("")
             ax.tick_params(labelbottom=False)
-    place = (1 - 3.1 / width, 0.5 / height, 2.8 / width, 0.12 / height)
+    place = (1 - 3.45 / width, 0.5 / height, 2.8 / width, 0.12 / height)
     cax = figure.add_axes(place)
     colors = ScalarMappable(Normalize(*limits), style.COLOR_MAP)
     bar = figure.colorbar(colors, cax=cax, orientation="horizontal", extend="both")
