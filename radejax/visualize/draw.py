@@ -314,7 +314,8 @@ def draw_samples(
     """
     has_image = any(scene.image is not None for _, scene, _ in samples)
     figure = style.new_figure(13.5 + 5.5 * has_image, 5.0 * len(samples))
-    layout = {"wspace": 0.35, "left": 0.06, "right": 0.97, "bottom": 0.04, "top": 0.95}
+    right = 0.97 if has_image else 0.93  # a color bar is on the right of the last map
+    layout = {"wspace": 0.35, "left": 0.06, "right": right, "bottom": 0.04, "top": 0.95}
     ratios = [1, 1, 1, 1.5][: 3 + has_image]
     axes = figure.subplots(
         len(samples),
