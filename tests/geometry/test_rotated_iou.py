@@ -48,19 +48,11 @@ def test_half_overlap_by_hand():
     car = np.array([[10.0, 0, 0, 4, 2, 2, 0]])
     ahead = np.array([[12.0, 0, 0, 4, 2, 2, np.pi]])
     above = np.array([[12.0, 0, 1, 4, 2, 2, 0]])
+    touching = np.array([[14.0, 2, 2, 4, 2, 2, 0]])
     np.testing.assert_allclose(bev(car, ahead), [[4 / 12]], rtol=1e-6)
     np.testing.assert_allclose(volume(car, above), [[4 / 28]], rtol=1e-6)
     np.testing.assert_allclose(R.bev_intersection(car, ahead), [4.0])
-
-
-def test_square_turned_by_45_degrees_is_an_octagon():
-    square = np.array([[0.0, 0, 0, 2, 2, 1, 0]])
-    turned = np.array([[0.0, 0, 0, 2, 2, 1, np.pi / 4]])
-    octagon = 8 * (np.sqrt(2) - 1)
-    np.testing.assert_allclose(R.bev_intersection(square, turned), [octagon])
-    np.testing.assert_allclose(
-        bev(square, turned), [[octagon / (8 - octagon)]], rtol=1e-6
-    )
+    assert bev(car, touching) == volume(car, touching) == 0
 
 
 @pytest.mark.parametrize(
@@ -84,14 +76,25 @@ def test_agrees_with_the_released_code_where_that_is_right(pairs):
     np.testing.assert_allclose(volume_pairs(a, b), pairs["iou_3d"][usable], atol=5e-4)
 
 
-def test_matrix_agrees_with_shapely():
-    rng = np.random.default_rng(1)
-    a, b = random_boxes(rng, 60), random_boxes(rng, 40)
-    area_a, area_b = a[:, 3] * a[:, 4], b[:, 3] * b[:, 4]
-    shared = shapely.area(shapely.intersection(polygons(a)[:, None], polygons(b)))
-    expected = shared / (area_a[:, None] + area_b - shared)
-    assert (expected > 0.1).sum() > 100
-    np.testing.assert_allclose(bev(a, b), expected, atol=5e-7)
+def test_every_box_is_compared_with_every_other_of_its_frame():
+    """In float32 on a device, also of bfloat16, and in float64 on the host."""
+    boxes = random_boxes(np.random.default_rng(1), 70).reshape(2, 35, 7)
+    a, b = boxes[:, :20], boxes[:, 20:]
+    area_a, area_b = a[..., 3] * a[..., 4], b[..., 3] * b[..., 4]
+    shared = shapely.area(
+        shapely.intersection(polygons(a)[:, :, None], polygons(b)[:, None])
+    )
+    expected = shared / (area_a[:, :, None] + area_b[:, None] - shared)
+    for function, dtype, atol in (
+        (bev, np.float32, 5e-7),
+        (R.bev_iou, np.float64, 1e-7),
+    ):
+        found = function(a, b)
+        assert found.dtype == dtype
+        np.testing.assert_allclose(found, expected, atol=atol)
+    assert bev(a[0], b[0, :0]).shape == (20, 0)
+    narrow = jnp.asarray(a[0]).astype(jnp.bfloat16)
+    np.testing.assert_allclose(bev(narrow, narrow).diagonal(), 1, atol=1e-6)
 
 
 def nearly(rng, a, scale):
@@ -101,7 +104,7 @@ def nearly(rng, a, scale):
     return b.astype(np.float32)
 
 
-@pytest.mark.parametrize("scale", [1e-7, 1e-5, 1e-4, 1e-2])
+@pytest.mark.parametrize("scale", [1e-7, 1e-4])
 def test_nearly_identical_boxes_against_shapely(scale):
     rng = np.random.default_rng(2)
     a = random_boxes(rng, 2000)
@@ -130,16 +133,6 @@ def test_boxes_slid_along_an_edge_share_collinear_edges(along):
     np.testing.assert_allclose(bev_pairs(a, b), bev_host(a, b), atol=1e-6)
 
 
-def test_touching_boxes_do_not_overlap():
-    a = np.array([[0.0, 0, 0, 4, 2, 1, 0]] * 4, np.float32)
-    b = a.copy()
-    b[:, :2] = [[4, 0], [-4, 0], [0, 2], [4, 2]]
-    np.testing.assert_array_equal(bev_pairs(a, b), 0)
-    b[:, :2] = 0
-    b[:, 2] = 1  # on top of each other
-    np.testing.assert_array_equal(volume_pairs(a, b), 0)
-
-
 box_numbers = st.tuples(
     st.floats(-6, 6, width=32),
     st.floats(-6, 6, width=32),
@@ -156,15 +149,24 @@ def as_box(numbers):
 
 
 @settings(deadline=None, max_examples=100)
-@given(box_numbers, box_numbers)
-def test_symmetric_bounded_and_bev_at_least_volume(a, b):
+@given(box_numbers, box_numbers, st.floats(-3, 3), st.floats(-30, 30))
+@example((1, 0, 0, 1, 2, 1, -1.2), (1, 0, 0, 4, 2, 1, -1.2), 1.0, 10.0)
+def test_any_two_boxes(a, b, yaw, shift):
+    """As shapely says, in [0, 1], symmetric, and unchanged by a common rigid motion."""
     a, b = as_box(a), as_box(b)
-    ground, space = float(bev_pairs(a, b)[0]), float(volume_pairs(a, b)[0])
-    assert 0 <= space <= 1
-    assert 0 <= ground <= 1
-    np.testing.assert_allclose(ground, bev_pairs(b, a), atol=1e-6)
-    np.testing.assert_allclose(space, volume_pairs(b, a), atol=1e-6)
-    np.testing.assert_allclose(ground, bev_host(a, b), atol=2e-6)
+    expected = shapely_intersection(a, b)
+    np.testing.assert_allclose(R.bev_intersection(a, b), expected, atol=1e-7)
+    sin, cos = np.sin(yaw), np.cos(yaw)
+    turn = np.eye(7)
+    turn[:2, :2] = [[cos, -sin], [sin, cos]]
+    motion = np.array([shift, 2 * shift, 1.0, 0, 0, 0, yaw])
+    moved = [box.astype(np.float64) @ turn.T + motion for box in (a, b)]
+    for on_host, on_device in ((bev_host, bev_pairs), (volume_host, volume_pairs)):
+        iou = on_host(a, b)
+        assert 0 <= iou[0] <= 1
+        np.testing.assert_allclose(on_host(b, a), iou, atol=1e-9)
+        np.testing.assert_allclose(on_host(*moved), iou, atol=1e-9)
+        np.testing.assert_allclose(on_device(a, b), iou, atol=5e-6)
 
 
 @settings(deadline=None, max_examples=50)
@@ -180,29 +182,6 @@ def test_identical_boxes_have_iou_1(a):
     half_turn = a + np.array([0, 0, 0, 0, 0, 0, np.pi], np.float32)
     # Adding pi rounds the angle by 1e-7, which long boxes feel most.
     np.testing.assert_allclose(bev_pairs(a, half_turn), 1, atol=1e-5)
-
-
-@settings(deadline=None, max_examples=100)
-@given(box_numbers, box_numbers, st.floats(-3, 3), st.floats(-30, 30))
-def test_unchanged_by_a_common_rigid_motion(a, b, yaw, shift):
-    a, b = as_box(a).astype(np.float64), as_box(b).astype(np.float64)
-    translation = np.array([shift, 2 * shift, 1.0])
-    sin, cos = np.sin(yaw), np.cos(yaw)
-    turn = np.eye(7)
-    turn[:2, :2] = [[cos, -sin], [sin, cos]]
-    motion = np.array([*translation, 0, 0, 0, yaw])
-    moved = [box @ turn.T + motion for box in (a, b)]
-    np.testing.assert_allclose(bev_host(*moved), bev_host(a, b), atol=1e-9)
-    np.testing.assert_allclose(volume_host(*moved), volume_host(a, b), atol=1e-9)
-
-
-@settings(deadline=None, max_examples=100)
-@given(box_numbers, box_numbers)
-@example((1, 0, 0, 1, 2, 1, -1.2), (1, 0, 0, 4, 2, 1, -1.2))
-def test_against_shapely(a, b):
-    a, b = as_box(a), as_box(b)
-    expected = shapely_intersection(a, b)
-    np.testing.assert_allclose(R.bev_intersection(a, b), expected, atol=1e-7)
 
 
 def test_degenerate_and_huge_boxes_are_finite():
@@ -235,24 +214,6 @@ def test_yaw_vector_of_8_scales_the_box():
     np.testing.assert_allclose(bev(eight, box), [[0.25]], rtol=1e-6)
     eight[:, 6:] = 0
     np.testing.assert_array_equal(bev(eight, box), [[0.0]])
-
-
-def test_shapes_batch_and_vmap():
-    boxes = random_boxes(np.random.default_rng(6), 24).reshape(2, 3, 4, 7)
-    nested = bev(boxes, boxes)
-    assert nested.shape == (2, 3, 4, 4)
-    mapped = jax.vmap(jax.vmap(bev))(boxes, boxes)
-    np.testing.assert_allclose(nested, mapped, atol=1e-7)
-    assert bev(boxes[0, 0], boxes[0, 1, :0]).shape == (4, 0)
-
-
-def test_boxes_are_compared_in_float32_on_devices_and_float64_on_the_host():
-    boxes = random_boxes(np.random.default_rng(7), 5)
-    matrix = bev(*[jnp.asarray(boxes).astype(jnp.bfloat16)] * 2)
-    assert matrix.dtype == jnp.float32
-    np.testing.assert_allclose(matrix.diagonal(), 1, atol=1e-6)
-    for function in (R.bev_intersection, R.bev_iou, R.iou_3d):
-        assert function(boxes, boxes).dtype == np.float64
 
 
 @pytest.mark.wrong_types
