@@ -41,12 +41,17 @@ def test_arrays_are_what_was_written(tmp_path, array):
         assert one.dtype == array.dtype
 
 
-def test_a_shape_beyond_the_file_is_named(tmp_path):
+def test_a_shape_that_is_not_the_files_is_named(tmp_path):
     content = npy(np.zeros(4)).replace(b"(4,), }            ", b"(400000000000,), }  ")
     (tmp_path / "a.npy").write_bytes(content)
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
         archive.writestr("first.npy", content)
-    for reader, name in ((read_npy, "a.npy"), (read_npz, "a.npz")):
+    (tmp_path / "b.npy").write_bytes(npy(np.zeros(4)) + b"more")
+    for reader, name in (
+        (read_npy, "a.npy"),
+        (read_npy, "b.npy"),
+        (read_npz, "a.npz"),
+    ):
         with pytest.raises(DataError, match=f"{name}: corrupted"):
             reader(tmp_path / name)
 

@@ -1,7 +1,6 @@
 """The folder of compiled programs: where it is, its size, and what leaves it alone."""
 
 import os
-import pathlib
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -10,6 +9,15 @@ import jax
 import pytest
 
 from radejax.core import compilation_cache
+
+
+@pytest.fixture
+def values(monkeypatch):
+    """Settings of JAX, of which the cache is not set."""
+    found: dict[str, object] = {"jax_compilation_cache_dir": None}
+    config = SimpleNamespace(values=found, update=found.__setitem__)
+    monkeypatch.setattr(jax, "config", config)
+    return found
 
 
 @pytest.mark.parametrize(
@@ -21,23 +29,17 @@ from radejax.core import compilation_cache
     ],
 )
 def test_compiled_programs_are_stored_with_and_without_a_home_folder(
-    home: str, caches: str, found: str | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    values: dict[str, object] = {"jax_compilation_cache_dir": None}
-    config = SimpleNamespace(values=values, update=values.__setitem__)
-    monkeypatch.setattr(jax, "config", config)
+    home, caches, found, values, monkeypatch
+):
     monkeypatch.setattr(os.path, "expanduser", lambda path: path.replace("~", home))
     monkeypatch.setenv("XDG_CACHE_HOME", caches)
-    compilation_cache.enable_compilation_cache()
-    assert values["jax_compilation_cache_dir"] == found
-    values["jax_compilation_cache_dir"] = "/mine"
-    compilation_cache.enable_compilation_cache()
-    assert values["jax_compilation_cache_dir"] == "/mine"
+    for expected in (found, "/mine"):
+        compilation_cache.enable_compilation_cache()
+        assert values["jax_compilation_cache_dir"] == expected
+        values["jax_compilation_cache_dir"] = "/mine"
 
 
-def test_programs_used_least_recently_are_deleted(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_programs_used_least_recently_are_deleted(values, tmp_path, monkeypatch):
     monkeypatch.setattr(compilation_cache, "_MAX_BYTES", 250)
     folder = tmp_path / "radejax" / "jax"
     folder.mkdir(parents=True)
@@ -46,9 +48,6 @@ def test_programs_used_least_recently_are_deleted(
         os.utime(folder / f"{name}-cache", (3600 * hours, 3600 * hours))
     os.utime(folder / "read-cache", (9e9, 0))  # written first, read last
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    values: dict[str, object] = {"jax_compilation_cache_dir": None}
-    config = SimpleNamespace(values=values, update=values.__setitem__)
-    monkeypatch.setattr(jax, "config", config)
     compilation_cache.enable_compilation_cache()
     assert {path.name for path in folder.iterdir()} == {"read-cache", "new-cache"}
 
@@ -60,9 +59,7 @@ jax.jit(lambda x: x + 1)(1.0)
 """
 
 
-def test_files_of_a_killed_process_do_not_stop_the_cache(
-    tmp_path: pathlib.Path,
-) -> None:
+def test_files_of_a_killed_process_do_not_stop_the_cache(tmp_path):
     folder = tmp_path / "radejax" / "jax"
     folder.mkdir(parents=True)
     (folder / "orphan-cache").write_bytes(b"half a program")

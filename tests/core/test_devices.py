@@ -2,9 +2,6 @@
 
 import os
 import signal
-from collections.abc import Iterator
-from types import SimpleNamespace
-from typing import Any
 
 import chex
 import jax
@@ -14,64 +11,34 @@ import pytest
 from jax.sharding import PartitionSpec
 
 from radejax.core import devices
-from radejax.core.errors import UserError
 
 from .. import processes
-
-
-@pytest.fixture
-def two(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Makes this process one of two; returns what happens between them, in order."""
-    events: list[str] = []
-
-    def wait(*_: Any, **__: Any) -> None:
-        events.append("wait")
-
-    def become(index: int, *, main_is_fine: bool = True) -> list[str]:
-        def gather(value: np.ndarray) -> np.ndarray:
-            events.append("gather")
-            return np.stack([value if index == 0 else np.int32(main_is_fine), value])
-
-        monkeypatch.setattr(jax, "process_count", lambda: 2)
-        monkeypatch.setattr(jax, "process_index", lambda: index)
-        client = SimpleNamespace(wait_at_barrier=wait)
-        monkeypatch.setattr(devices.jax_distributed.global_state, "client", client)
-        monkeypatch.setattr(devices.multihost_utils, "process_allgather", gather)
-        return events
-
-    return become
-
-
-def test_the_others_wait_while_the_main_process_works(two: Any) -> None:
-    events = two(0)
-    assert devices.main_only(lambda: events.append("work") or 5) == 5
-    assert events == ["work", "wait", "gather"]
-    events.clear()
-    two(1)
-    assert devices.main_only(lambda: events.append("work")) is None
-    assert events == ["wait", "gather"]
-
-
-def test_an_error_of_the_main_process_reaches_the_others(two: Any) -> None:
-    def fail() -> None:
-        raise OSError("broken")
-
-    events = two(0)
-    with pytest.raises(OSError, match="broken"):
-        devices.main_only(fail)
-    assert events == ["wait", "gather"]
-    two(1, main_is_fine=False)
-    with pytest.raises(UserError, match="process 0 stopped with an error"):
-        devices.main_only(fail)
-
 
 # Two processes ask each other until one of them is killed or fails.
 TALK = (
     processes.JOIN
     + """
+import pathlib
+import time
+
+from radejax.core.errors import UserError
+
+def write():
+    time.sleep(0.3)
+    pathlib.Path(sys.argv[1]).write_text("written")
+
+def fail():
+    raise OSError("no data")
+
 with devices.end_with_others():
+    devices.main_only(write)
+    assert pathlib.Path(sys.argv[1]).read_text() == "written"  # the others have waited
+    try:
+        devices.main_only(fail)
+    except (OSError, UserError) as error:
+        print(type(error).__name__, error, flush=True)
     print("ready", flush=True)
-    while devices.all_agree(sys.argv[1] == "nobody fails"):
+    while devices.all_agree(sys.argv[2] == "nobody fails"):
         pass
     if index == 1:
         raise OSError("a defect")
@@ -81,8 +48,9 @@ with devices.end_with_others():
 
 
 @pytest.mark.parametrize("victim", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_a_killed_process_ends_the_other_in_one_line(victim: int) -> None:
-    started = processes.start(2, "-c", TALK, "nobody fails")
+def test_a_killed_process_ends_the_other_in_one_line(victim, tmp_path):
+    path = str(tmp_path / "a.txt")
+    started = processes.start(2, "-c", TALK, path, "nobody fails")
     processes.wait_for("ready", started)
     started[victim].kill()
     output = processes.outputs_of(started, timeout_s=30)[1 - victim]
@@ -91,10 +59,14 @@ def test_a_killed_process_ends_the_other_in_one_line(victim: int) -> None:
     assert "Traceback" not in output
 
 
-def test_a_process_that_fails_ends_the_other() -> None:
-    started = processes.start(2, "-c", TALK, "one fails")
+def test_a_process_that_fails_ends_the_other(tmp_path):
+    path = str(tmp_path / "a.txt")
+    started = processes.start(2, "-c", TALK, path, "one fails")
     outputs = processes.outputs_of(started, timeout_s=60)
     assert [process.returncode for process in started] == [1, 1]
+    assert "OSError no data" in outputs[0].splitlines()
+    message = "UserError process 0 stopped with an error, see its output"
+    assert message in outputs[1].splitlines()
     line = processes.lost(1).replace(
         "was lost", "stopped with an error, see its output"
     )
@@ -104,22 +76,22 @@ def test_a_process_that_fails_ends_the_other() -> None:
 
 
 @pytest.fixture
-def stop() -> Iterator[Any]:
+def stop():
     mesh = devices.make_mesh(1)
     with devices.stop_on_signal(mesh) as should_stop:
         yield should_stop
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGINT", "SIGUSR1"])
-def test_signals_ask_to_stop(stop: Any, name: str) -> None:
+def test_signals_ask_to_stop(stop, name):
     assert not stop()
     os.kill(os.getpid(), signal.Signals[name])
     assert stop()
 
 
 def test_the_second_signal_of_a_closed_terminal_is_ignored_and_that_of_a_user_is_not(
-    stop: Any,
-) -> None:
+    stop,
+):
     # The shell and the kernel both send SIGHUP when a terminal is closed.
     for number in (signal.SIGHUP, signal.SIGHUP, signal.SIGUSR1):
         os.kill(os.getpid(), number)
@@ -128,7 +100,7 @@ def test_the_second_signal_of_a_closed_terminal_is_ignored_and_that_of_a_user_is
         os.kill(os.getpid(), signal.SIGTERM)
 
 
-def test_under_nohup_a_closed_terminal_is_ignored() -> None:
+def test_under_nohup_a_closed_terminal_is_ignored():
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         with devices.stop_on_signal(devices.make_mesh(1)) as should_stop:
@@ -139,7 +111,7 @@ def test_under_nohup_a_closed_terminal_is_ignored() -> None:
         signal.signal(signal.SIGHUP, before)
 
 
-def test_put_batch_splits_the_leading_axis() -> None:
+def test_put_batch_splits_the_leading_axis():
     mesh = devices.make_mesh(4)
     batch = {"x": np.arange(24.0).reshape(8, 3), "i": np.arange(8)}
     placed = devices.put_batch(batch, mesh)
@@ -147,7 +119,7 @@ def test_put_batch_splits_the_leading_axis() -> None:
     assert [s.data.shape for s in placed["x"].addressable_shards] == [(2, 3)] * 4
 
 
-def test_fsdp_splits_the_widest_axis_that_divides() -> None:
+def test_fsdp_splits_the_widest_axis_that_divides():
     mesh = devices.make_mesh(4)
     state = {
         "kernel": jax.ShapeDtypeStruct((3, 3, 128, 256), jnp.float32),

@@ -11,10 +11,8 @@ import pytest
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
 
-FULL = OSError(errno.ENOSPC, "No space left on device")
 
-
-def test_an_error_leaves_the_old_file_and_nothing_else(tmp_path: pathlib.Path) -> None:
+def test_an_error_leaves_the_old_file_and_nothing_else(tmp_path):
     path = tmp_path / "a.json"
     files.write_json(path, {"x": 1})
     with pytest.raises(RuntimeError), files.atomic_path(path) as temporary:  # noqa: PT012
@@ -24,7 +22,33 @@ def test_an_error_leaves_the_old_file_and_nothing_else(tmp_path: pathlib.Path) -
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_files_have_the_mode_that_the_umask_says(tmp_path: pathlib.Path) -> None:
+@pytest.mark.skipif(not pathlib.Path("/dev/full").exists(), reason="only on Linux")
+def test_a_short_write_of_numpy_is_a_full_disk(tmp_path):
+    """NumPy raises an OSError without an error number."""
+    with (
+        pytest.raises(UserError, match="no space left on the disk of"),
+        files.atomic_path(tmp_path / "a.npy"),
+        open("/dev/full", "wb") as file,
+    ):
+        np.save(file, np.zeros(100_000))
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(OSError, match="Input/output"), files.disk_full("x/a.json"):
+        raise OSError(errno.EIO, "Input/output error")
+
+
+def test_temporary_paths_differ_in_one_process(tmp_path):
+    # Two containers may have equal host names and process ids.
+    paths = {files.temporary_path(tmp_path / "a.npy") for _ in range(100)}
+    assert len(paths) == 100
+
+
+def test_damaged_json_is_named(tmp_path):
+    (tmp_path / "a.json").write_text('{"x": ')
+    with pytest.raises(DataError, match=r"a\.json is not valid JSON"):
+        files.read_json(tmp_path / "a.json")
+
+
+def test_files_have_the_mode_that_the_umask_says(tmp_path):
     for umask, mode in ((0o022, 0o644), (0o002, 0o664), (0o077, 0o600)):
         before = os.umask(umask)
         try:
@@ -34,44 +58,7 @@ def test_files_have_the_mode_that_the_umask_says(tmp_path: pathlib.Path) -> None
         assert stat.S_IMODE((tmp_path / "a.json").stat().st_mode) == mode
 
 
-def test_full_disk_is_one_clear_error(tmp_path: pathlib.Path) -> None:
-    with (
-        pytest.raises(UserError, match="no space left on the disk of"),
-        files.atomic_path(tmp_path / "a.json"),
-    ):
-        raise FULL
-    assert not list(tmp_path.iterdir())
-
-
-def test_temporary_paths_differ_in_one_process(tmp_path: pathlib.Path) -> None:
-    # Two containers may have equal host names and process ids.
-    paths = {files.temporary_path(tmp_path / "a.npy") for _ in range(100)}
-    assert len(paths) == 100
-
-
-@pytest.mark.skipif(not pathlib.Path("/dev/full").exists(), reason="only on Linux")
-def test_a_short_write_of_numpy_is_a_full_disk() -> None:
-    # NumPy raises an OSError without an error number.
-    with (
-        pytest.raises(UserError, match="no space left on the disk of"),
-        files.disk_full("x/a.npy"),
-        open("/dev/full", "wb") as file,
-    ):
-        np.save(file, np.zeros(100_000))
-
-
-def test_other_errors_of_a_disk_stay_as_they_are() -> None:
-    with pytest.raises(OSError, match="Input/output"), files.disk_full("x/a.json"):
-        raise OSError(errno.EIO, "Input/output error")
-
-
-def test_damaged_json_is_named(tmp_path: pathlib.Path) -> None:
-    (tmp_path / "a.json").write_text('{"x": ')
-    with pytest.raises(DataError, match=r"a\.json is not valid JSON"):
-        files.read_json(tmp_path / "a.json")
-
-
-def test_a_folder_is_one_jobs(tmp_path: pathlib.Path) -> None:
+def test_a_folder_is_one_jobs(tmp_path):
     path = tmp_path / "new" / "plan.json"
     plan = {"a": {"b": (1, 2), "long": list(range(90))}, "seed": 0, "watch": 1}
     files.claim(path, plan, "another job")
@@ -87,7 +74,7 @@ def test_a_folder_is_one_jobs(tmp_path: pathlib.Path) -> None:
         files.claim(path, other, "another job", fix="give --out")
 
 
-def test_a_lock_is_held_once(tmp_path: pathlib.Path) -> None:
+def test_a_lock_is_held_once(tmp_path):
     path = tmp_path / "new" / "lock"
     with (
         files.lock(path, "somebody is here"),
@@ -99,7 +86,7 @@ def test_a_lock_is_held_once(tmp_path: pathlib.Path) -> None:
         pass
 
 
-def test_files_are_found_through_links_once(tmp_path: pathlib.Path) -> None:
+def test_files_are_found_through_links_once(tmp_path):
     root, disk = tmp_path / "root", tmp_path / "disk"
     for name in ("5/a.npy", "5/b.txt", "5/deep/c.npy"):
         (disk / name).parent.mkdir(parents=True, exist_ok=True)
@@ -114,9 +101,7 @@ def test_files_are_found_through_links_once(tmp_path: pathlib.Path) -> None:
         files.find_files(tmp_path / "none", "*")
 
 
-def test_the_home_folder_is_replaced(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_home_folder_is_replaced(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     files.write_json("~/new/a.json", [1])
     assert files.read_json("~/new/a.json") == [1]

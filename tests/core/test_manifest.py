@@ -15,16 +15,13 @@ from radejax.core.manifest import (
 )
 
 
-def test_a_folder_without_a_description_has_no_manifest(tmp_path):
-    assert Manifest.open(tmp_path) is None
-
-
 def test_what_several_calls_log_is_read_by_the_next_one(tmp_path):
     source = tmp_path / "radar.npy"
     source.write_bytes(b"1234")
     state = state_of([source, None, tmp_path / "absent.png"])
     assert [entry[:2] for entry in state] == [["radar.npy", 4]]
     job = tmp_path / "out"
+    assert Manifest.open(tmp_path) is None
     for name in ("a.json", "b.json"):
         Manifest.claim(job, "boxes", {}, ["a.json", "b.json"])
         add(job, name, state)
@@ -81,31 +78,24 @@ def test_a_folder_in_which_nothing_was_written_may_get_other_options(tmp_path):
         claim("points", 2)
 
 
-@pytest.mark.parametrize(
-    ("options", "names", "message"),
-    [
-        ({"step": 2}, ["a"], "holds other boxes: options.step is 1 there and 2 here"),
-        ({"step": 1}, ["a", "b"], r"names is \['a'\] there and \['a', 'b'\] here"),
-    ],
-)
-def test_another_job_in_the_folder_is_an_error(tmp_path, options, names, message):
+def test_another_job_in_the_folder_is_an_error(tmp_path):
     Manifest.claim(tmp_path, "boxes", {"step": 1}, ["a"])
     content = json.loads((tmp_path / "manifest.json").read_text())
     content["radejax"] = "0.1.0"  # another version may continue
     (tmp_path / "manifest.json").write_text(json.dumps(content))
     Manifest.claim(tmp_path, "boxes", {"step": 1}, ["a"])
+    message = "other boxes: options.step is 1 there and 2 here"
     with pytest.raises(UserError, match=message):
-        Manifest.claim(tmp_path, "boxes", options, names)
+        Manifest.claim(tmp_path, "boxes", {"step": 2}, ["a"])
+    message = r"names is \['a'\] there and \['a', 'b'\] here"
+    with pytest.raises(UserError, match=message):
+        Manifest.claim(tmp_path, "boxes", {"step": 1}, ["a", "b"])
 
 
 @pytest.mark.parametrize(
     ("logged", "there", "message"),
     [
-        (
-            "a",
-            "a",
-            "an interrupted job, which did not write 1 of 2 files, such as b.json",
-        ),
+        ("a", "a", "an interrupted job, which did not write 1 of 2 files, such as b"),
         ("ab", "b", "a partial copy, without 1 of 2 files, such as a.json"),
         (
             "ab",

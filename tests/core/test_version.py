@@ -1,16 +1,11 @@
 """The commits that runs, exports and reports name."""
 
-import pathlib
 import subprocess
-
-import pytest
 
 from radejax.core import version
 
 
-def test_the_commit_of_a_clone_tells_of_changes(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_commit_of_a_clone_tells_of_changes(tmp_path, monkeypatch):
     assert version.commit(tmp_path) == "not in a repository"
 
     def git(*words: str) -> str:

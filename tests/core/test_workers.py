@@ -76,13 +76,14 @@ def test_an_error_beside_the_work_ends_the_workers(tmp_path):
     assert time.monotonic() - start < 30
 
 
-def test_a_killed_worker_is_one_line(tmp_path):
-    def dies():
-        with process_pool(2, os.chdir, tmp_path) as submit:
+def test_a_worker_that_is_killed_or_cannot_start_is_one_line(tmp_path):
+    def dies(start_folder):
+        with process_pool(2, os.chdir, start_folder) as submit:
             submit(signal.raise_signal, signal.SIGKILL).result()
 
-    with pytest.raises(UserError, match=r"a worker process ended early.*fewer workers"):
-        dies()
+    for start_folder in (tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(UserError, match=r"process ended early.*fewer workers"):
+            dies(start_folder)
 
 
 def test_errors_of_a_worker_are_raised_here(tmp_path):
@@ -90,15 +91,6 @@ def test_errors_of_a_worker_are_raised_here(tmp_path):
         with pytest.raises(DataError, match="line 3"):
             submit(exec, "raise error", {"error": DataError("line 3")}).result()
         assert submit(os.getpid).result() != os.getpid()  # it continues to work
-
-
-def test_a_start_that_fails_is_one_line(tmp_path):
-    def fails():
-        with process_pool(1, os.chdir, tmp_path / "nowhere") as submit:
-            submit(os.getpid).result()
-
-    with pytest.raises(UserError, match="a worker process ended early"):
-        fails()
 
 
 def test_a_script_without_a_guard_names_what_it_lacks(tmp_path):
@@ -118,22 +110,6 @@ def test_a_script_without_a_guard_names_what_it_lacks(tmp_path):
 # Numbers of CPUs and workers -------------------------------------------------------------
 
 
-@pytest.fixture
-def machine(tmp_path, monkeypatch):
-    """A machine of 64 CPUs; returns a function that writes files of its kernel."""
-    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(64)))
-    monkeypatch.setattr(workers, "_PROC", tmp_path / "proc")
-    monkeypatch.setattr(workers, "_CONTROL_GROUPS", tmp_path / "groups")
-
-    def write(texts):
-        for name, text in texts.items():
-            path = tmp_path / name
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(text)
-
-    return write
-
-
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="no affinity here")
 def test_cpus_are_those_of_the_affinity():
     before = os.sched_getaffinity(0)
@@ -144,53 +120,52 @@ def test_cpus_are_those_of_the_affinity():
         os.sched_setaffinity(0, before)
 
 
-def test_cpus_without_control_groups_and_with_unlimited_ones(machine):
-    assert usable_cpus() == 64
-    machine({"proc/self/cgroup": "0::/\n3:cpu,cpuacct:/\n"})
-    assert usable_cpus() == 64
-    machine(
-        {
-            "groups/cpu.max": "max 100000\n",
-            "groups/cpu/cpu.cfs_quota_us": "-1\n",
-            "groups/cpu/cpu.cfs_period_us": "100000\n",
-        }
-    )
-    assert usable_cpus() == 64
+CONTAINER = {
+    "proc/self/cgroup": "2:memory:/job\n0::/job/step\n",
+    "groups/job/step/cpu.max": "max 100000\n",
+}
+CPUS_OF_VERSION_1 = {
+    "proc/self/cgroup": "7:cpu,cpuacct:/docker/1a\n2:memory:/docker/1a\n",
+    "groups/cpu/cpu.cfs_period_us": "100000\n",
+}
+MEMORY = {"proc/meminfo": "MemTotal:  9000000 kB\nMemAvailable:  7200000 kB\n"}
+MEMORY_OF_VERSION_1 = MEMORY | {
+    "proc/self/cgroup": "2:memory:/job\n",
+    "groups/memory/memory.limit_in_bytes": "9223372036854771712\n",
+}
+MEMORY_OF_VERSION_2 = MEMORY | {"proc/self/cgroup": "0::/job\n"}
+LIMIT = "groups/memory/job/memory.limit_in_bytes"
 
 
-@pytest.mark.parametrize(("quota", "count"), [(300_000, 3), (150_000, 2), (1_000, 1)])
-def test_cpus_of_a_container(machine, quota, count):
-    """A limit in the group of the process or in one above it, of either version."""
-    machine(
-        {
-            "proc/self/cgroup": "2:memory:/job\n0::/job/step\n",
-            "groups/job/cpu.max": f"{quota} 100000\n",
-            "groups/job/step/cpu.max": "max 100000\n",
-        }
-    )
-    assert usable_cpus() == count
-    machine({"proc/self/cgroup": "7:cpu,cpuacct:/docker/1a\n2:memory:/docker/1a\n"})
-    assert usable_cpus() == 64
-    machine(
-        {
-            "groups/cpu/cpu.cfs_quota_us": f"{quota}\n",
-            "groups/cpu/cpu.cfs_period_us": "100000\n",
-        }
-    )
-    assert usable_cpus() == count
-
-
-def test_workers_fit_into_the_memory(machine):
-    """Each needs 450 MB of a half of the memory."""
-    assert default_workers() == 64
-    machine({"proc/meminfo": "MemTotal:  9000000 kB\nMemAvailable:  7200000 kB\n"})
-    assert default_workers() == 8
-    machine({"proc/self/cgroup": "2:memory:/job\n"})
-    machine({"groups/memory/memory.limit_in_bytes": "9223372036854771712\n"})
-    assert default_workers() == 8
-    machine({"groups/memory/job/memory.limit_in_bytes": "2000000000\n"})
-    assert default_workers() == 2
-    machine({"proc/self/cgroup": "0::/job\n", "groups/job/memory.max": "max\n"})
-    assert default_workers() == 8
-    machine({"groups/job/memory.max": "100000000\n"})
-    assert default_workers() == 1
+@pytest.mark.parametrize(
+    ("texts", "num_cpus", "num_workers"),
+    [
+        ({}, 64, 64),
+        ({"proc/self/cgroup": "0::/\n3:cpu,cpuacct:/\n"}, 64, 64),
+        (CONTAINER, 64, 64),
+        # A limit in the group of the process or in one above it, of either version.
+        (CONTAINER | {"groups/job/cpu.max": "300000 100000\n"}, 3, 3),
+        (CONTAINER | {"groups/job/cpu.max": "150000 100000\n"}, 2, 2),
+        (CONTAINER | {"groups/job/cpu.max": "1000 100000\n"}, 1, 1),
+        (CPUS_OF_VERSION_1 | {"groups/cpu/cpu.cfs_quota_us": "-1\n"}, 64, 64),
+        (CPUS_OF_VERSION_1 | {"groups/cpu/cpu.cfs_quota_us": "150000\n"}, 2, 2),
+        # Each worker needs 450 MB of a half of the memory.
+        (MEMORY, 64, 8),
+        (MEMORY_OF_VERSION_1, 64, 8),
+        (MEMORY_OF_VERSION_1 | {LIMIT: "2000000000\n"}, 64, 2),
+        (MEMORY_OF_VERSION_2 | {"groups/job/memory.max": "max\n"}, 64, 8),
+        (MEMORY_OF_VERSION_2 | {"groups/job/memory.max": "100000000\n"}, 64, 1),
+    ],
+)
+def test_workers_fit_into_the_cpus_and_the_memory(
+    texts, num_cpus, num_workers, tmp_path, monkeypatch
+):
+    """A machine of 64 CPUs with these files of its kernel."""
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(64)))
+    monkeypatch.setattr(workers, "_PROC", tmp_path / "proc")
+    monkeypatch.setattr(workers, "_CONTROL_GROUPS", tmp_path / "groups")
+    for name, text in texts.items():
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    assert (usable_cpus(), default_workers()) == (num_cpus, num_workers)
