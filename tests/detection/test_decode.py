@@ -10,11 +10,12 @@ from hypothesis import strategies as st
 from radejax.config import load_config
 from radejax.core.structures import WIDE_ROI, DetectionMaps
 from radejax.detection import decode as D
+from radejax.geometry.boxes import boxes7_from_8
 from radejax.geometry.radar_grid import RadarGrid
 
 KRADAR = RadarGrid.kradar()
 OFFICIAL = {112: KRADAR.padded(8, "stretched"), 107: KRADAR.padded(1, "stretched")}
-CASES = ("padded_wide_roi", "padded_no_roi", "unpadded_wide_roi", "unpadded_no_roi")
+CASES = ("padded_wide_roi", "unpadded_no_roi")
 GRID = RadarGrid.reduced(num_doppler=4, num_range=20, num_elevation=4, num_azimuth=12)
 C = 3
 RELEASED = D.DecodeOptions(max_detections=16, threshold_inclusive=False)
@@ -187,58 +188,55 @@ def decode_scene(logits, params, **options):
     return decode(maps_of(logits, params), GRID, **options)
 
 
-def test_encoded_boxes_come_back():
-    logits, params, cells, classes = scattered()
+def test_encoded_boxes_come_back_with_the_outputs_of_their_bins():
+    logits, params, cells, classes = scattered(num=7)
     rng = np.random.default_rng(1)
     boxes = np.zeros((len(cells), 7))
     boxes[:, :2] = GRID.bin_to_ego(*cells.T) + rng.uniform(-1, 1, (len(cells), 2))
     boxes[:, 2:6] = rng.uniform(0.5, 3, (len(cells), 4))
     boxes[:, 6] = rng.uniform(-3, 3, len(cells))
+    boxes[1] = boxes[0]  # which NMS removes
+    kept = [0, 2, 3, 4, 5, 6]
     for (i, j), box in zip(cells, boxes, strict=True):
         offset = box[:2] - GRID.bin_to_ego(i, j)
         heading = [np.sin(box[6]), np.cos(box[6])]
         params[0, i, j] = [*offset, box[2], *box[3:6], *heading]
-    found = decode_scene(logits, params)
-    np.testing.assert_allclose(found.boxes[0, :6], boxes, atol=2e-5)
-    np.testing.assert_array_equal(found.classes[0], [*classes] + [-1] * 10)
+    rows, columns = np.indices(logits.shape[1:3])
+    outputs = {"bin": jnp.asarray(np.stack([rows, columns], -1)[None])}
+    outputs["sum"] = outputs["bin"].sum(-1)
+    found = decode(maps_of(logits, params).replace(outputs=outputs), GRID)
+    np.testing.assert_allclose(found.boxes[0, :6], boxes[kept], atol=2e-5)
+    assert found.outputs["bin"][0, :6].tolist() == cells[kept].tolist()
+    made = found.to_boxes()
+    assert made.extras["sum"].tolist() == cells[kept].sum(1).tolist()
+    assert made.to_list()[0]["bin"] == cells[0].tolist()
+    np.testing.assert_array_equal(found.classes[0], [*classes[kept]] + [-1] * 10)
     np.testing.assert_array_equal(found.scores[0, 6:], 0)
     np.testing.assert_array_equal(found.boxes[0, 6:], 0)
     assert found.is_valid[0].tolist() == [True] * 6 + [False] * 10
 
 
-def test_boxes_have_the_outputs_of_their_bins():
-    logits, params, cells, _ = scattered()
-    maps = maps_of(logits, params)
-    rows, columns = np.meshgrid(*map(np.arange, logits.shape[1:3]), indexing="ij")
-    outputs = {"bin": jnp.asarray(np.stack([rows, columns], -1)[None])}
-    outputs["sum"] = outputs["bin"].sum(-1)
-    found = decode(maps.replace(outputs=outputs), GRID)
-    assert found.outputs["bin"][0, :6].tolist() == cells.tolist()
-    boxes = found.to_boxes()
-    assert boxes.extras["sum"].tolist() == cells.sum(1).tolist()
-    assert boxes.to_list()[0]["bin"] == cells[0].tolist()
-
-
-def test_what_k_cuts_off_is_counted():
+@pytest.mark.parametrize(
+    ("size_m", "max_detections", "pre_nms", "num_found", "num_truncated"),
+    [
+        (1, 16, None, 10, 0),
+        (1, 6, None, 6, 4),
+        (1, 6, 10, 6, 4),
+        (500, 5, None, 1, 0),  # everything overlaps; what NMS drops is not truncated
+        (500, 5, 7, 1, 3),
+    ],
+)
+def test_what_k_cuts_off_is_counted(
+    size_m, max_detections, pre_nms, num_found, num_truncated
+):
     logits, params, _, _ = scattered(num=10)
-    counts = {}
-    for k, pre_nms in ((16, None), (6, None), (6, 10)):
-        found = decode_scene(logits, params, max_detections=k, pre_nms=pre_nms)
-        counts[k, pre_nms] = int(found.num_truncated[0])
-        assert int(found.is_valid[0].sum()) == min(k, 10)
-        assert found.boxes.shape == (1, k, 7)
-        assert (np.diff(found.scores[0]) <= 0).all()
-    assert counts == {(16, None): 0, (6, None): 4, (6, 10): 4}
-
-
-def test_boxes_dropped_by_nms_are_not_counted_as_cut():
-    logits, params, _, _ = scattered(num=10)
-    params[..., 3:5] = 500  # everything overlaps
-    found = decode_scene(logits, params, max_detections=5)
-    assert int(found.is_valid[0].sum()) == 1
-    assert int(found.num_truncated[0]) == 0
-    few = decode_scene(logits, params, max_detections=5, pre_nms=7)
-    assert int(few.num_truncated[0]) == 3
+    params[..., 3:5] = size_m
+    options = {"max_detections": max_detections, "pre_nms": pre_nms}
+    found = decode_scene(logits, params, **options)
+    assert found.boxes.shape == (1, max_detections, 7)
+    assert int(found.is_valid.sum()) == num_found
+    assert int(found.num_truncated[0]) == num_truncated
+    assert (np.diff(found.scores[0]) <= 0).all()
 
 
 def test_region_bounds_are_inclusive_and_leave_room_for_others():
@@ -296,17 +294,13 @@ def test_detections_of_the_released_code(case):
     found = jax.device_get(_decode(maps, grid, options))
     for frame in range(3):
         kept = want[f"boxes_before_nms_{frame}"][want[f"kept_{frame}"]]
-        norm = np.hypot(kept[:, 6], kept[:, 7])[:, None]
         count = len(kept)
         assert int(found.is_valid[frame].sum()) == count
         np.testing.assert_allclose(found.scores[frame, :count], kept[:, 8], atol=1e-6)
         np.testing.assert_array_equal(found.classes[frame, :count], kept[:, 9])
-        boxes = found.boxes[frame, :count]
-        yaw = np.arctan2(kept[:, 6], kept[:, 7])
-        np.testing.assert_allclose(boxes[:, 6], yaw, atol=2e-5)
-        np.testing.assert_allclose(boxes[:, :3], kept[:, :3], atol=2e-5)
-        np.testing.assert_allclose(boxes[:, 3:5], kept[:, 3:5] * norm, atol=2e-5)
-        np.testing.assert_allclose(boxes[:, 5], kept[:, 5], atol=2e-5)
+        expected = boxes7_from_8(kept[:, :8])
+        expected[:, 3:5] *= np.hypot(kept[:, 6], kept[:, 7])[:, None]
+        np.testing.assert_allclose(found.boxes[frame, :count], expected, atol=2e-5)
     np.testing.assert_array_equal(found.num_truncated, 0)
 
 
@@ -327,19 +321,6 @@ def test_thresholds_and_region_are_traced_values():
         same = jax.device_get(_decode(maps_of(logits, params), GRID, options))
         jax.tree.map(np.testing.assert_array_equal, found, same)
     assert _decode._cache_size() == count + 3
-
-
-def test_frames_of_a_batch_do_not_mix():
-    scenes = [scattered(num=n, seed=n)[:2] for n in (0, 3, 9)]
-    batch = maps_of(*(np.concatenate(x) for x in zip(*scenes, strict=True)))
-    together = decode(batch, GRID)
-    for i, scene in enumerate(scenes):
-        alone = decode_scene(*scene)
-        for found, wanted in zip(
-            jax.tree.leaves(together), jax.tree.leaves(alone), strict=True
-        ):
-            np.testing.assert_allclose(found[i], wanted[0], rtol=1e-6)
-    assert together.is_valid.sum(1).tolist() == [0, 3, 9]
 
 
 def test_bfloat16_maps_and_saturated_or_missing_numbers():
@@ -364,8 +345,6 @@ def test_wrong_shapes_are_rejected():
         (lambda: D.decode(few, GRID, RELEASED), r"12, 7\), expected \[B, R, A, C\]"),
         (lambda: D.decode(maps, GRID, RELEASED, pre_nms=0), "1 peak must enter NMS"),
         (lambda: D.decode(maps, GRID, RELEASED, roi=np.zeros(4)), r"roi must be \[6\]"),
-        (lambda: RELEASED.replace(raw_yaw="yes"), "config.decode.raw_yaw is 'yes'"),
-        (lambda: RELEASED.replace(max_detections=0), "max_detections is 0, expected"),
         (lambda: RELEASED.replace(roi=(0, 1)), "config.decode.roi is .* six numbers"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -389,5 +368,3 @@ def test_a_size_is_never_negative(raw_yaw):
     assert float(released.boxes[0, 0, 3]) == (
         np.float32(-0.2) if raw_yaw == "nms" else 0.0
     )
-    assert load_config("configs/radenet.py:official").decode.clip_sizes is False
-    assert load_config("configs/radenet.py").decode.clip_sizes is True
