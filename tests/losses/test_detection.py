@@ -1,6 +1,7 @@
 import json
 from functools import partial
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,13 +12,11 @@ from radejax.detection.decode import DecodeOptions
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.detection import LossOptions, detection_loss
 from radejax.losses.focal import gaussian_heatmap
-from radejax.losses.gwd import gwd_loss
+from radejax.losses.gwd import gwd, gwd_loss
 
 STRETCHED = RadarGrid.kradar().padded(8, "stretched")
 CASES = (
-    "batch4_sigma3",
     "batch4_sigma0p75",
-    "single_frame_sigma0p75",
     "one_object_sigma3",
     "batch2_adaptive",
     "batch2_anisotropic",
@@ -190,32 +189,6 @@ def loss_and_grad(maps, batch, decoding=None, **options):
     return _loss_and_grad(maps, batch, json.dumps(options), decoding)
 
 
-def naive_regression(maps, batch, transform="sqrt"):
-    """GWD and smooth L1 object by object, frame by frame."""
-    totals = np.zeros(2)
-    for b in range(len(batch.boxes)):
-        frame = []
-        for n in np.flatnonzero(batch.is_valid[b]):
-            wanted = np.asarray(batch.boxes[b, n])
-            i, j = GRID.nearest_bin(*wanted[:2])
-            predicted = np.array(maps.box_params[b, i, j])
-            predicted[:2] += GRID.bin_to_ego(i, j)
-            gap = np.abs(predicted - wanted)
-            l1 = np.where(gap < 1, gap**2 / 2, gap - 0.5).mean()
-            pair = jnp.asarray(predicted), jnp.asarray(wanted)
-            frame.append([float(gwd_loss(*pair, transform=transform)), l1])
-        totals += np.mean(frame, 0) if frame else 0
-    return totals / len(batch.boxes)
-
-
-def test_regression_losses_object_by_object():
-    maps, batch = small_scene(np.random.default_rng(0))
-    (_, parts), _ = loss_and_grad(maps, batch)
-    expected = naive_regression(maps, batch)
-    np.testing.assert_allclose([parts["gwd"], parts["smooth_l1"]], expected, rtol=1e-5)
-    assert int(parts["num_matched"]) == int(parts["num_objects"]) == 4
-
-
 def test_parts_weigh_as_asked_whatever_their_size():
     maps, batch = small_scene(np.random.default_rng(1))
     (total, parts), grad = loss_and_grad(maps, batch)
@@ -227,25 +200,16 @@ def test_parts_weigh_as_asked_whatever_their_size():
     )
     assert float(plain) == pytest.approx(4)
     assert float(parts["weighted_sum"]) == pytest.approx(4)
-    for found, wanted in zip(
-        jax.tree.leaves(grad), jax.tree.leaves(plain_grad), strict=True
-    ):
-        np.testing.assert_allclose(found, wanted, atol=1e-6)
-
-
-def test_a_part_without_a_weight_is_not_computed():
-    maps, batch = small_scene(np.random.default_rng(1))
-    (total, parts), _ = loss_and_grad(
-        maps, batch, weights={"focal": 3.0}, normalize=False
-    )
-    assert not {"gwd", "smooth_l1"} & set(parts)
+    chex.assert_trees_all_close(grad, plain_grad, atol=1e-6)
+    options = {"weights": {"focal": 3.0}, "normalize": False}
+    (total, terms), _ = loss_and_grad(maps, batch, **options)
+    assert not {"gwd", "smooth_l1"} & set(terms)
     np.testing.assert_allclose(total, 3 * parts["focal"], 1e-5)
 
 
-@pytest.mark.parametrize("assignment", ["center", "nms"])
-def test_without_objects_everything_is_finite(assignment):
+def test_without_objects_everything_is_finite():
     maps, batch = small_scene(np.random.default_rng(2), counts=(0, 0, 0))
-    (total, parts), grad = loss_and_grad(maps, batch, assignment=assignment)
+    (total, parts), grad = loss_and_grad(maps, batch, assignment="nms")
     assert float(total) == pytest.approx(2)
     assert all(np.isfinite(v) for v in parts.values())
     assert all(np.isfinite(g).all() for g in jax.tree.leaves(grad))
@@ -294,24 +258,32 @@ def test_normalized_yaw_ignores_the_length_of_the_vector():
     assert np.isfinite(grad.box_params).all()
 
 
-def scene_with_peaks():
-    """Two objects in the first of three frames; peaks on one, behind it, and far off.
+def scene(peaks, objects, num_frames=1):
+    """Peaks (logits by bin and class) and objects (x, y, class) in the first frame.
 
     All boxes are squares of 8 m; bins are 5.1 m and 7 degrees apart.
     """
-    logits = np.full((3, 24, 16, 2), -6.0, np.float32)
-    for (i, j), logit in {(10, 8): 3.0, (12, 8): 2.0, (18, 3): 1.0}.items():
-        logits[0, i, j, 0] = logit
-    params = np.zeros((3, 24, 16, 8), np.float32)
-    boxes = np.zeros((3, 4, 8), np.float32)
+    logits = np.full((num_frames, 24, 16, 2), -9.0, np.float32)
+    for place, logit in peaks.items():
+        logits[0][place] = logit
+    params = np.zeros((num_frames, 24, 16, 8), np.float32)
+    boxes = np.zeros((num_frames, 4, 8), np.float32)
     for array in (params, boxes):
         array[..., 3:6], array[..., 7] = (8.0, 8.0, 2.0), 1
-    boxes[0, 0, :2] = GRID.bin_to_ego(10, 8) + np.array([1.0, 0.5])
-    boxes[0, 1, :2] = GRID.bin_to_ego(5, 2)
-    is_valid = np.zeros((3, 4), bool)
-    is_valid[0, :2] = True
+    classes = np.zeros((num_frames, 4), np.int32)
+    for row, (x, y, cls) in enumerate(objects):
+        boxes[0, row, :2], classes[0, row] = (x, y), cls
+    is_valid = np.zeros((num_frames, 4), bool)
+    is_valid[0, : len(objects)] = True
     maps = DetectionMaps(jnp.asarray(logits), jnp.asarray(params))
-    return maps, batch_of(boxes, np.zeros((3, 4), np.int32), is_valid)
+    return maps, batch_of(boxes, classes, is_valid)
+
+
+def scene_with_peaks():
+    """Two objects in the first of three frames; peaks on one, behind it, and far off."""
+    x, y = GRID.bin_to_ego(10, 8) + np.array([1.0, 0.5])
+    objects = [(x, y, 0), (*GRID.bin_to_ego(5, 2), 0)]
+    return scene({(10, 8, 0): 3.0, (12, 8, 0): 2.0, (18, 3, 0): 1.0}, objects, 3)
 
 
 def test_nms_matching_by_hand():
@@ -339,17 +311,9 @@ def test_nms_matching_by_hand():
 )
 def test_nms_matching_chooses_boxes_as_decoding_does(changes, num_matched):
     # Two boxes 8 m long and 5.1 m apart, of other classes and with a score of 0.5.
-    logits = np.full((1, 24, 16, 2), -9.0, np.float32)
-    params = np.zeros((1, 24, 16, 8), np.float32)
-    boxes = np.zeros((1, 2, 8), np.float32)
-    for row, cell in enumerate(((10, 8), (11, 8))):
-        logits[0, *cell, row] = 0.0
-        boxes[0, row, :2] = GRID.bin_to_ego(*cell)
-    for array in (params, boxes):
-        array[..., 3:6], array[..., 7] = (8.0, 8.0, 2.0), 1
-    batch = batch_of(boxes, np.array([[0, 1]]), np.ones((1, 2), bool))
+    objects = [(*GRID.bin_to_ego(10, 8), 0), (*GRID.bin_to_ego(11, 8), 1)]
+    maps, batch = scene({(10, 8, 0): 0.0, (11, 8, 1): 0.0}, objects)
     decoding = DecodeOptions(score_threshold=0.5, **changes)
-    maps = DetectionMaps(jnp.asarray(logits), jnp.asarray(params))
     options = LossOptions(assignment="nms")
 
     @jax.jit  # of all that it returns, only this is compiled
@@ -360,12 +324,35 @@ def test_nms_matching_chooses_boxes_as_decoding_does(changes, num_matched):
     assert count(maps) == num_matched
 
 
-def test_wrong_shapes_are_rejected():
+@pytest.mark.wrong_types
+def test_wrong_arguments_are_named():
     maps, batch = small_scene(np.random.default_rng(9))
-    with pytest.raises(ValueError, match=r"24, 16, .* on the grid's 256 x 112 bins"):
-        detection_loss(maps, batch, STRETCHED)
-    with pytest.raises(ValueError, match=r"must be \[3, N, 8\] .* got \(3, 4, 7\)"):
-        detection_loss(maps, batch.replace(boxes=batch.boxes[..., :7]), GRID)
+    narrow = batch.replace(boxes=batch.boxes[..., :7])
+    short = jnp.ones((2, 8))
+    call_heatmap = partial(
+        gaussian_heatmap, short, jnp.zeros(2, int), jnp.ones(2, bool)
+    )
+    for call, message in (
+        (
+            lambda: detection_loss(maps, batch, STRETCHED),
+            "on the grid's 256 x 112 bins",
+        ),
+        (
+            lambda: detection_loss(maps, narrow, GRID),
+            r"must be \[3, N, 8\] .* got \(3, 4, 7\)",
+        ),
+        (
+            lambda: call_heatmap(GRID, num_classes=2, sigma_mode="round"),
+            "sigma_mode is 'round', expected one of",
+        ),
+        (lambda: gwd(short[:, :7], short), r"must be \[..., 8\], got \(2, 7\)"),
+        (
+            lambda: gwd_loss(short, short, transform="log"),
+            "transform is 'log', expected",
+        ),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call()
 
 
 # Own outputs and targets --------------------------------------------------------------

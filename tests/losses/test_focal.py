@@ -2,8 +2,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses import focal as F
@@ -53,85 +51,28 @@ SIZES = np.array([(4.0, 2), (9, 3), (1, 0.8), (2, 5), (4, 2)])
     ],
 )
 def test_targets_equal_the_definition(sigma, sigmas):
+    """Of two frames, of which the second has a row of padding and a class outside the maps."""
+    boxes = np.stack([objects(CELLS, SIZES)] * 2)
+    boxes[1, 3] = np.nan
+    classes = np.stack([CLASSES] * 2)
+    classes[1, 4] = 7
+    is_valid = np.ones((2, 5), bool)
+    is_valid[1, 3] = False
     options = {"num_classes": C, "sigma_mode": sigma, "sigma_bins": 1.5}
-    found = heatmap(objects(CELLS, SIZES), CLASSES, np.ones(5, bool), GRID, **options)
-    np.testing.assert_allclose(found, naive_heatmap(CELLS, CLASSES, sigmas), atol=1e-6)
-
-
-@settings(deadline=None, max_examples=30)
-@given(
-    st.lists(
-        st.tuples(st.integers(1, 23), st.integers(0, 15), st.integers(0, 2)),
-        min_size=4,
-        max_size=4,
-    ),
-    st.integers(0, 4),
-)
-def test_centers_are_exactly_1_and_nothing_exceeds_it(rows, num_valid):
-    rows = np.array(rows)
-    is_valid = np.arange(4) < num_valid
-    found = np.asarray(
-        heatmap(objects(rows[:, :2]), rows[:, 2], is_valid, GRID, num_classes=C)
-    )
-    for i, j, cls in rows[:num_valid]:
-        assert found[i, j, cls] == 1
-    assert found.min() >= 0
-    assert found.max() == (1 if num_valid else 0)
-
-
-def test_padding_rows_draw_nothing_whatever_they_hold():
-    boxes = objects(CELLS)
-    boxes[2:] = np.nan
-    is_valid = np.arange(5) < 2
-    found = heatmap(boxes, CLASSES, is_valid, GRID, num_classes=C)
-    alone = heatmap(boxes[:2], CLASSES[:2], is_valid[:2], GRID, num_classes=C)
-    np.testing.assert_allclose(found, alone, atol=1e-7)
-
-
-def test_class_outside_the_maps_draws_nothing():
-    found = heatmap(
-        objects(CELLS[:2]), np.array([-1, 7]), np.ones(2, bool), GRID, num_classes=C
-    )
-    assert not np.asarray(found).any()
+    found = heatmap(boxes, classes, is_valid, GRID, **options)
+    for frame, count in zip(found, (5, 3), strict=True):
+        expected = naive_heatmap(CELLS[:count], CLASSES[:count], sigmas[:count])
+        np.testing.assert_allclose(frame, expected, atol=1e-6)
+        is_center = tuple(np.c_[CELLS, CLASSES][:count].T)
+        np.testing.assert_array_equal(frame[is_center], 1)
+        assert frame.max() == 1
 
 
 @pytest.mark.parametrize("sigma", ["adaptive", "anisotropic"])
-def test_object_of_zero_size_is_one_bin(sigma):
-    found = np.asarray(
-        heatmap(
-            objects([(5, 5)], (0.0, 0.0)),
-            np.array([1]),
-            np.array([True]),
-            GRID,
-            num_classes=C,
-            sigma_mode=sigma,
-        )
-    )
-    assert found[5, 5, 1] == 1
-    assert found.sum() == 1
-
-
-def test_batches_and_vmap_agree():
-    boxes = np.stack([objects(CELLS), objects(CELLS[::-1])])
-    classes, is_valid = np.stack([CLASSES, CLASSES]), np.ones((2, 5), bool)
-    batch = heatmap(boxes, classes, is_valid, GRID, num_classes=C)
-    one = lambda *a: F.gaussian_heatmap(*a, GRID, num_classes=C)  # noqa: E731
-    mapped = jax.jit(jax.vmap(one))(boxes, classes, is_valid)
-    assert batch.shape == (2, 24, 16, C)
-    np.testing.assert_allclose(batch, mapped, atol=1e-7)
-
-
-@pytest.mark.wrong_types
-def test_unknown_sigma_is_rejected():
-    with pytest.raises(ValueError, match="sigma_mode is 'round', expected one of"):
-        F.gaussian_heatmap(
-            jnp.zeros((1, 8)),
-            jnp.zeros(1, int),
-            jnp.ones(1, bool),
-            GRID,
-            num_classes=C,
-            sigma_mode="round",
-        )
+def test_an_object_of_zero_size_is_one_bin(sigma):
+    point = objects([(5, 5)], (0.0, 0.0)), np.array([1]), np.array([True])
+    found = np.asarray(heatmap(*point, GRID, num_classes=C, sigma_mode=sigma))
+    assert found[5, 5, 1] == found.sum() == 1
 
 
 # Focal loss -----------------------------------------------------------------------
@@ -162,20 +103,15 @@ def test_single_bins_and_gradients_of_the_released_code(golden):
     assert (grad[(p == 0) | (p == 1)] == 0).all()
 
 
-def test_batch_is_divided_by_the_number_of_positive_bins():
+def test_a_batch_is_divided_by_its_positive_bins_or_all_if_there_are_none():
     rng = np.random.default_rng(0)
     p, target = rng.uniform(0.01, 0.99, (2, 2, 6, 5, 3))
+    loss = jax.jit(F.focal_loss)
+    mean = naive_focal(p, target).mean()
+    np.testing.assert_allclose(loss(logit(p), target), mean, rtol=1e-5)
     target[0, 1, 2, 0] = target[1, 3, 3, 2] = 1
     expected = naive_focal(p, target).sum() / 2
-    loss = jax.jit(F.focal_loss)(logit(p), target)
-    np.testing.assert_allclose(loss, expected, rtol=1e-5)
-
-
-def test_without_positive_bins_the_mean_over_all():
-    rng = np.random.default_rng(1)
-    p, target = rng.uniform(0.01, 0.99, (2, 2, 6, 5, 3))
-    loss = F.focal_loss(logit(p), jnp.asarray(target))
-    np.testing.assert_allclose(loss, naive_focal(p, target).mean(), rtol=1e-5)
+    np.testing.assert_allclose(loss(logit(p), target), expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
