@@ -73,7 +73,6 @@ def test_a_folder_that_is_written_is_the_one_that_was_read(
     ("size", "stream"),
     [
         ("64x96", 195),
-        ("224x224", 355),
         pytest.param("720x1280", 851, marks=pytest.mark.slow),
     ],
 )
@@ -90,31 +89,27 @@ def test_full_size_model(released, make, size, stream):
     np.testing.assert_allclose(tokens[file["token_index"]], expected, atol=TOLERANCE)
 
 
-def test_incomplete_or_corrupted_folders(folder, tmp_path):
-    config, weights = folder / "config.json", folder / "model.safetensors"
-    index = folder / "model.safetensors.index.json"
-    timm = {"blocks.0.attn.qkv.weight": np.zeros((3, 1), np.float32)}
-    timm_config = '{"architecture": "vit_small_patch16_dinov3"}'
-    with pytest.raises(FileNotFoundError, match=r"config.json and model.safetensors"):
-        dinov3_hf.load(tmp_path / "nowhere")
-    for change, message in (
-        (lambda: weights.write_bytes(weights.read_bytes()[:999]), "not a safetensors"),
-        (lambda: weights.unlink(), "lacks model.safetensors"),
-        (lambda: index.touch(), "has its weights in several files"),
-        (lambda: index.unlink() or weights.touch(), "not a safetensors file"),
-        (lambda: config.write_text("{"), "is not valid JSON"),
-        (lambda: config.write_text("[1]"), "config.json: expected a JSON object"),
-        (
-            lambda: (
-                safetensors.numpy.save_file(timm, weights)
-                or config.write_text(timm_config)
-            ),
-            "not the tensors of a DINOv3 ViT",
-        ),
-    ):
-        change()
-        with pytest.raises((DataError, UserError, FileNotFoundError), match=message):
-            dinov3_hf.load(folder)
+WEIGHTS = "model.safetensors"
+
+
+@pytest.mark.parametrize(
+    ("contents", "message"),
+    [
+        ({WEIGHTS: None}, f"lacks {WEIGHTS}"),
+        ({WEIGHTS: None, f"{WEIGHTS}.index.json": b""}, "weights in several files"),
+        ({WEIGHTS: b"PK" * 99}, "not a safetensors file"),
+        ({WEIGHTS: None, "config.json": None}, f"lacks config.json and {WEIGHTS}"),
+        ({"config.json": b"{"}, "is not valid JSON"),
+        ({"config.json": b"[1]"}, "config.json: expected a JSON object"),
+    ],
+)
+def test_incomplete_or_corrupted_folders(folder, contents, message):
+    for name, content in contents.items():
+        (folder / name).unlink(missing_ok=True)
+        if content is not None:
+            (folder / name).write_bytes(content)
+    with pytest.raises((DataError, UserError, FileNotFoundError), match=message):
+        dinov3_hf.load(folder)
 
 
 @pytest.mark.parametrize(
@@ -124,12 +119,10 @@ def test_incomplete_or_corrupted_folders(folder, tmp_path):
         ({"hidden_act": "relu"}, "is 'relu', expected 'gelu'"),
         ({"num_hidden_layers": None}, "lacks num_hidden_layers"),
         ({"num_hidden_layers": 10**9}, "is 1000000000, expected .* at most 65536"),
-        ({"num_hidden_layers": "8"}, "is '8', expected an integer"),
         ({"num_attention_heads": 7}, "hidden_size is 96, expected a multiple of 4"),
         ({"layer_norm_eps": float("nan")}, "is nan, expected 1e-05"),
-        ({"rope_theta": 10.0}, "is 10.0, expected 100.0"),
         ({"num_hidden_layers": 2}, "unexpected layer.2."),
-        ({"num_hidden_layers": 65536}, "missing layer.100."),
+        ({"num_hidden_layers": 200}, "missing layer.100."),
     ],
 )
 def test_other_models_are_rejected(change, message, make, tensors):
@@ -178,7 +171,7 @@ def test_features_of_the_original_code(sources, name, tmp_path):
     assert model.options.position_grid == (4 if "dinov2" in name else 0)
     sizes = [key.split("__")[1] for key in arrays if key.startswith(f"{name}__")]
     assert len(sizes) == (3 if "dinov2" in name else 2)
-    for size in sizes:
+    for size in sizes if name in ("meta", "dinov2") else sizes[-1:]:
         image = seeds.image(*map(int, size.split("x"))).transpose(0, 2, 3, 1)
         tokens = jax.jit(model.apply)(variables, image)[0, :, ::4]
         np.testing.assert_allclose(tokens, arrays[f"{name}__{size}"], atol=1.5e-5)
@@ -191,27 +184,16 @@ def test_features_of_the_original_code(sources, name, tmp_path):
     ("name", "change", "message"),
     [
         ("timm", {"architecture": "convnext_tiny"}, "architecture is 'convnext_tiny'"),
+        ("timm", {"patch_embed.proj.weight": None}, "not the tensors of a DINOv3"),
         ("dinov2", {"model_type": "tips"}, "json: model_type is 'tips', expected a"),
         ("dinov2", {"layer_norm_eps": 1e-5}, "json: layer_norm_eps is 1e-05, expected"),
-        ("dinov2", {"num_attention_heads": "2"}, "num_heads is '2', expected an"),
-        ("dinov2", {"num_hidden_layers": 3}, "missing layer.2."),
         ("dinov2", {"patch_size": 16}, r"patch_embeddings.weight .*14, 14\), expected"),
-        ("dinov2", {"model_type": "dinov3_vit"}, "DINOv3 config lacks"),
         ("meta", {"rope_embed.periods": [1, 2]}, "periods are not powers of 100"),
         ("meta", {"blocks.0.attn.qkv.bias_mask": [1] * 96}, "unexpected .*k_proj.bias"),
         ("meta", {"blocks.0.ls1.gamma": [np.nan] * 32}, "layer_scale1.* not finite"),
         ("meta", {"pos_embed": [0]}, "DINOv2 is read from its Hugging Face"),
         ("meta", {"cls_norm.weight": [1] * 32}, "unexpected cls_norm.weight"),
-        (
-            "timm_qkvb",
-            {"blocks.0.attn.q_bias": None},
-            "missing .*q_proj.bias",
-        ),
-        (
-            "timm_qkvb",
-            {"blocks.0.attn.v_bias": None},
-            "missing .*v_proj.bias",
-        ),
+        ("timm_qkvb", {"blocks.0.attn.q_bias": None}, "missing .*q_proj.bias"),
     ],
 )
 def test_other_files_are_rejected(sources, name, change, message, tmp_path):
@@ -228,11 +210,15 @@ def test_other_files_are_rejected(sources, name, change, message, tmp_path):
         dinov3_hf.load(path)
 
 
-def test_files_of_other_networks_are_rejected(tmp_path):
+def test_other_networks_are_neither_read_nor_written(sources, tmp_path):
     # The names of Meta's ConvNeXt.
     write_pth(tmp_path / "x.pth", {"stages.0.0.norm.bias": np.zeros(3, np.float32)})
     with pytest.raises(DataError, match=r"expected one state dict .*blocks\.0\."):
         dinov3_hf.load(tmp_path / "x.pth")
+    path = write(tmp_path, "dinov2", *description(sources, "dinov2"))
+    model, variables = dinov3_hf.load(path)
+    with pytest.raises(UserError, match="position_grid is 4, expected 0"):
+        dinov3_hf.save(model, variables["params"], tmp_path / "written")
 
 
 def test_rounded_wavelengths_are_those_of_the_base_100(sources, tmp_path):
@@ -243,11 +229,3 @@ def test_rounded_wavelengths_are_those_of_the_base_100(sources, tmp_path):
     rounded = np.float32([1, 3.15625, 10, 31.625])  # to bfloat16
     path = write(tmp_path, "meta", tensors | {"rope_embed.periods": rounded}, config)
     assert dinov3_hf.load(path)[0].options.num_heads == 2
-
-
-def test_only_dinov3_is_written(sources, tmp_path):
-    model, variables = dinov3_hf.load(
-        write(tmp_path, "dinov2", *description(sources, "dinov2"))
-    )
-    with pytest.raises(UserError, match="position_grid is 4, expected 0"):
-        dinov3_hf.save(model, variables["params"], tmp_path / "written")

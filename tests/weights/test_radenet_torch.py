@@ -102,14 +102,6 @@ def test_torch_tensors_are_taken_as_they_are(small_state):
     chex.assert_trees_all_equal(variables, expected)
 
 
-def test_nested_and_prefixed_checkpoints(small_state):
-    state = {f"module._orig_mod.{name}": x for name, x in small_state.items()}
-    checkpoint = {"epoch": 3, "model": state, "optimizer": {}}
-    _, variables = load(checkpoint, **OVERRIDES)
-    _, expected = load(small_state, **OVERRIDES)
-    chex.assert_trees_all_equal(variables, expected)
-
-
 def test_all_problems_are_listed(small_state):
     state = dict(small_state)
     del state["neck.neck.1.gn.bias"], state["head.reg_head.head.9.weight"]
