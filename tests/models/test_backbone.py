@@ -12,20 +12,6 @@ from radejax.models.options import RadeNetOptions
 from .. import small_models as small
 
 
-@pytest.mark.parametrize("widths", [(16,), (16, 32), (16, 32, 48, 64)])
-def test_any_number_of_levels(widths):
-    backbone = Backbone(8, widths, decoder_width=24, num_groups=8)
-    x = jnp.zeros((1, 32, 16, 13))
-    variables = jax.eval_shape(backbone.init, jax.random.key(0), x)
-    assert jax.eval_shape(backbone.apply, variables, x).shape == (1, 32, 16, 24)
-    names = [
-        f"{part}_{i + 1}"
-        for part in ("encoder", "decoder", "cbam")
-        for i in range(len(widths))
-    ]
-    assert set(names) <= set(variables["params"])
-
-
 class Double(SkipAttention):
     """An attention that is no attention."""
 

@@ -11,7 +11,7 @@ from radejax.models.radenet import RadeNet
 GRID = RadarGrid.reduced(num_doppler=2, num_range=13, num_elevation=2, num_azimuth=11)
 
 
-def test_map_grid_follows_padding_and_cropping() -> None:
+def test_map_grid_follows_padding_and_cropping():
     model = models.build(RadeNetOptions())
     whole = models.build(RadeNetOptions(crop_output=False))
     padded = models.map_grid(GRID, whole, "true")
@@ -24,7 +24,7 @@ def test_map_grid_follows_padding_and_cropping() -> None:
     assert not models.has_camera(model)
 
 
-def test_options_of_another_model_are_rejected() -> None:
+def test_options_of_another_model_are_rejected():
     with pytest.raises(UserError, match=r"'RadeNetOptions', expected DinoRadeOptions"):
         models.build(RadeNetOptions(name="dinorade"))
     assert models.options_class("radenet") is RadeNetOptions

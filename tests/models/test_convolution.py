@@ -21,7 +21,6 @@ def arrays(*shapes, seed=0):
 @pytest.mark.parametrize(
     ("shape", "features", "size", "dilation"),
     [
-        ((2, 83, 61, 3), 4, 1, 1),
         ((2, 83, 61, 3), 4, 3, 3),
         ((2, 83, 61, 3), 4, 7, 1),
         ((1, 7, 5, 3), 4, 3, 1),

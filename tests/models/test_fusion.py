@@ -136,14 +136,3 @@ def test_dropout_drops_in_training_only():
     assert 0.3 < share < 0.7
     kept = np.asarray(dropped) != 0
     np.testing.assert_allclose(dropped[kept], 2 * np.asarray(plain)[kept], rtol=1e-5)
-
-
-def test_every_parameter_has_a_gradient():
-    module, args = fusion(), inputs()
-
-    def loss(variables):
-        return jnp.sum(module.apply(variables, *args) ** 3)
-
-    gradient = jax.jit(jax.grad(loss))(variables_of(module, args))
-    sizes = jax.tree.map(lambda g: float(np.abs(g).max()), gradient)
-    assert all(0 < size < np.inf for size in jax.tree.leaves(sizes))
