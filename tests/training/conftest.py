@@ -67,7 +67,7 @@ class Tiny:
 
 
 @pytest.fixture(scope="session")
-def tiny() -> Tiny:
+def tiny():
     """One bright bin an object, so that a few steps learn something."""
     grid = small_grid()
     config = radar_config().replace(
@@ -127,7 +127,7 @@ def make_frames(grid: RadarGrid, seed: int) -> Batch:
 
 
 @pytest.fixture
-def workdir(tmp_path: pathlib.Path) -> pathlib.Path:
+def workdir(tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
     return folder

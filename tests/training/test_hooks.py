@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import pathlib
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
@@ -21,7 +20,7 @@ def _step(state: Any, batch: int) -> tuple[Any, Any]:
     return after, {"loss": jnp.float32(batch)}
 
 
-def test_hooks_are_called_in_order_after_each_step() -> None:
+def test_hooks_are_called_in_order_after_each_step():
     calls: list[Any] = []
 
     def named(name: str) -> hooks.Hook:
@@ -37,31 +36,14 @@ def test_hooks_are_called_in_order_after_each_step() -> None:
     assert calls[:2] == [("a", 2, 7), ("b", 2, 7)]
 
 
-def test_values_that_an_own_hook_returns_are_logged(tmp_path: pathlib.Path) -> None:
-    own = lambda step, state, metrics: {"norm": 2.5} if step == 3 else None  # noqa: E731
-    with MetricWriter(tmp_path, Config(), 0) as writer:
-        hook = hooks.logged(own, writer)
-        for step in (2, 3, 4):
-            hook(step, None, {})
-    (line,) = (tmp_path / "metrics.jsonl").read_text().splitlines()
-    row = json.loads(line)
-    assert (row["step"], row["norm"]) == (3, 2.5)
-
-
-def test_a_hook_that_returns_something_else_is_named(tmp_path: pathlib.Path) -> None:
-    def wrong(*_: Any) -> Any:
-        return "text"
-
-    with MetricWriter(tmp_path, Config(), 0) as writer:
-        hook = hooks.logged(wrong, writer)
-        with pytest.raises(
-            UserError, match=r"of wrong in config\.train\.hooks is 'text'"
-        ):
-            hook(1, None, {})
-
-
-def test_the_loop_stops_between_steps() -> None:
-    answers = iter([False, False, True])
+def test_the_loop_stops_between_steps_of_which_two_are_under_way(monkeypatch):
+    waited_for: list[float] = []
+    monkeypatch.setattr(
+        loop.jax,
+        "block_until_ready",
+        lambda metrics: waited_for.append(float(metrics["loss"])),
+    )
+    answers = iter([False] * 5 + [True])
     state: Any = SimpleNamespace(step=0, seen=[])
     state = loop.train(
         state,
@@ -71,11 +53,27 @@ def test_the_loop_stops_between_steps() -> None:
         num_steps=9,
         should_stop=lambda: next(answers),
     )
-    assert state.seen == [0, 1]
+    assert state.seen == [0, 1, 2, 3, 4]
+    assert waited_for == [0, 1, 2]  # from the third step on, for that two steps before
+
+
+def test_values_that_an_own_hook_returns_are_logged(tmp_path):
+    def own(step: int, *_: Any) -> Any:
+        return {3: {"norm": 2.5}, 4: "text"}.get(step)
+
+    with MetricWriter(tmp_path, Config(), 0) as writer:
+        hook = hooks.logged(own, writer)
+        for step in (2, 3):
+            hook(step, None, {})
+        message = r"of own in config\.train\.hooks is 'text'"
+        with pytest.raises(UserError, match=message):
+            hook(4, None, {})
+    row = json.loads((tmp_path / "metrics.jsonl").read_text())
+    assert (row["step"], row["norm"]) == (3, 2.5)
 
 
 @pytest.fixture
-def wait(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], float]:
+def wait(monkeypatch):
     """Function that sets the hooks' clock forward, which moves by 1 ns per look at it."""
     now = 0.0
 
@@ -93,12 +91,7 @@ def _batches(wait: Callable[[float], float], *seconds: float) -> Any:
     return (SimpleNamespace(frame=wait(x)) for x in seconds)
 
 
-def test_waiting_for_data_is_warned_of_once(
-    wait: Callable[[float], float],
-    tmp_path: pathlib.Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_waiting_for_data_is_warned_of_once(wait, tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(hooks, "usable_cpus", lambda: 7)
     config = Config()
     throughput = hooks.Throughput(_batches(wait, 0.0, 0.2, 0.2), 0)
@@ -124,9 +117,7 @@ def test_waiting_for_data_is_warned_of_once(
     assert "on 7 CPUs" in caplog.text
 
 
-def test_a_batch_that_is_loaded_while_the_devices_work_costs_no_time(
-    wait: Callable[[float], float],
-) -> None:
+def test_a_batch_that_is_loaded_while_the_devices_work_costs_no_time(wait):
     class Busy:
         def is_ready(self) -> bool:
             return False

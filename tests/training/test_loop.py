@@ -7,9 +7,7 @@ import pathlib
 import re
 import shutil
 import signal
-from collections.abc import Iterator
 from typing import Any
-from unittest import mock
 
 import chex
 import grain
@@ -35,7 +33,7 @@ STEPS_PER_EPOCH = 4
 
 
 @pytest.fixture(scope="module", autouse=True)
-def compiled_once() -> Iterator[None]:
+def compiled_once():
     """Steps of equal options are the same function, which JAX traces once."""
 
     found: dict[Any, Any] = {}
@@ -60,7 +58,7 @@ def compiled_once() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def run(tiny: Tiny) -> Any:
+def run(tiny):
     """`fit` on the tiny data."""
     return tiny.fit
 
@@ -69,14 +67,14 @@ SAME = {"frames to train on": 16, "sha256 of their keys": "ab"}
 
 
 @pytest.fixture(scope="module")
-def undisturbed(run: Any, tmp_path_factory: pytest.TempPathFactory) -> Any:
+def undisturbed(run, tmp_path_factory):
     """Result and folder of a run from start to end."""
     folder = tmp_path_factory.mktemp("undisturbed")
     return run(folder, info={"same": SAME}), folder
 
 
 @pytest.fixture
-def finished(undisturbed: Any, workdir: pathlib.Path) -> pathlib.Path:
+def finished(undisturbed, workdir):
     """Copy of the folder of that run."""
     return shutil.copytree(undisturbed[1], workdir, dirs_exist_ok=True)
 
@@ -114,7 +112,7 @@ def check_equal(result: Any, undisturbed: Any) -> None:
     chex.assert_trees_all_equal(state, undisturbed[0][0])
 
 
-def test_a_run_ends_after_its_epochs_and_learns(undisturbed: Any) -> None:
+def test_a_run_ends_after_its_epochs_and_learns(undisturbed):
     (state, is_finished), folder = undisturbed
     assert is_finished
     assert state.step == 8
@@ -123,25 +121,8 @@ def test_a_run_ends_after_its_epochs_and_learns(undisturbed: Any) -> None:
     assert losses[-1][1] < losses[0][1]
 
 
-def test_a_run_ends_after_the_given_steps(
-    run: Any, tiny: Tiny, tmp_path: pathlib.Path
-) -> None:
-    config = tiny.config.replace(train={"max_steps": 8, "evaluate_every_epochs": 1})
-    options = {"config": config, "steps_per_epoch": 6}
-    evaluate = mock.Mock(return_value=Scores({}, best=1.0))
-    state, is_finished = run(tmp_path, validate=evaluate, **options)
-    assert is_finished
-    assert state.step == 8
-    assert evaluate.call_count == 2  # after the first epoch and at the end
-    again, is_finished = run(tmp_path, **options)  # there is nothing left to do
-    assert is_finished
-    chex.assert_trees_all_equal(again, state)
-
-
 @pytest.mark.slow
-def test_a_seed_initializes_the_variables(
-    run: Any, tiny: Tiny, tmp_path: pathlib.Path
-) -> None:
+def test_a_seed_initializes_the_variables(run, tiny, tmp_path):
     def initial(name: str, seed: int) -> Any:
         rates = {"learning_rate": 1e-30, "final_learning_rate": 0.0}
         config = tiny.config.replace(seed=seed, train={"num_epochs": 1} | rates)
@@ -156,8 +137,8 @@ def test_a_seed_initializes_the_variables(
 
 @pytest.mark.parametrize("batch", [2, pytest.param(6, marks=pytest.mark.slow)])
 def test_a_crash_costs_the_steps_since_the_checkpoint_and_no_digit(
-    batch: int, run: Any, tiny: Tiny, undisturbed: Any, workdir: pathlib.Path
-) -> None:
+    batch, run, tiny, undisturbed, workdir
+):
     def crash() -> None:
         raise RuntimeError("power cut")
 
@@ -169,20 +150,7 @@ def test_a_crash_costs_the_steps_since_the_checkpoint_and_no_digit(
     assert _losses(workdir) == _losses(undisturbed[1])
 
 
-def test_sigterm_saves_and_stops(
-    run: Any, tiny: Tiny, undisturbed: Any, workdir: pathlib.Path
-) -> None:
-    terminate = functools.partial(os.kill, os.getpid(), signal.SIGTERM)
-    state, is_finished = run(workdir, Stopping(tiny.loader(), 6, terminate))
-    assert not is_finished
-    with Checkpoints(workdir / "checkpoints", read_only=True) as checkpoints:
-        assert checkpoints.steps()[-1] == state.step == 5
-    check_equal(run(workdir), undisturbed)
-
-
-def test_sigterm_in_an_evaluation_saves_and_stops(
-    run: Any, tiny: Tiny, undisturbed: Any, workdir: pathlib.Path
-) -> None:
+def test_sigterm_saves_and_stops(run, tiny, undisturbed, workdir):
     config = tiny.config.replace(train={"evaluate_every_epochs": 1})
 
     def evaluate(_: Any, should_stop: Any) -> Scores:
@@ -192,11 +160,14 @@ def test_sigterm_in_an_evaluation_saves_and_stops(
             raise devices.Stopped
         raise AssertionError("the signal was not seen")
 
-    def start() -> Any:
-        return run(workdir, config=config, validate=evaluate)
+    def start(*batches: Any) -> Any:
+        return run(workdir, *batches, config=config, validate=evaluate)
 
-    for step in (4, 8):  # the second time in the evaluation at the end
-        state, is_finished = start()
+    terminate = functools.partial(os.kill, os.getpid(), signal.SIGTERM)
+    # While a batch is loaded, in an evaluation, and in the one at the end.
+    interrupted = [(Stopping(tiny.loader(), 3, terminate),), (), ()]
+    for step, batches in zip((2, 4, 8), interrupted, strict=True):
+        state, is_finished = start(*batches)
         assert (int(state.step), is_finished) == (step, False)
         with Checkpoints(workdir / "checkpoints", read_only=True) as checkpoints:
             assert checkpoints.steps()[-1] == step
@@ -204,8 +175,8 @@ def test_sigterm_in_an_evaluation_saves_and_stops(
 
 
 def test_a_run_continues_with_the_same_data_and_frozen_weights_only(
-    run: Any, undisturbed: Any, finished: pathlib.Path
-) -> None:
+    run, undisturbed, finished
+):
     message = r"something else: sha256 of their keys is 'ab' there and 'cd' here; give"
     with pytest.raises(UserError, match=message):
         run(finished, info={"same": SAME | {"sha256 of their keys": "cd"}})
@@ -214,57 +185,25 @@ def test_a_run_continues_with_the_same_data_and_frozen_weights_only(
 
 
 @pytest.mark.slow
-def test_frozen_parameters_are_saved_and_stay_as_they_were(
-    run: Any, tiny: Tiny, workdir: pathlib.Path
-) -> None:
-    freeze = ("backbone/encoder_*",)
-
+def test_frozen_parameters_are_saved_and_stay_as_they_were(run, tiny, workdir):
     def train(steps: int) -> TrainState:
-        length = {"freeze": freeze, "max_steps": steps}
-        state: TrainState = run(workdir, config=tiny.config.replace(train=length))[0]
+        changes = {"freeze": ("backbone/encoder_*",), "max_steps": steps}
+        state: TrainState = run(workdir, config=tiny.config.replace(train=changes))[0]
         return state
 
     train(3)
-    with Checkpoints(workdir / "checkpoints", read_only=True) as checkpoints:
-        saved, *_ = checkpoints.restore_variables()
     whole = flatten_dict(dict(tiny.variables["params"]), sep="/")
-    frozen = flatten_dict(saved["frozen"], sep="/")
-    expected = {name for name in whole if name.startswith("backbone/encoder_")}
-    assert frozen.keys() == expected
-    for name, values in frozen.items():
-        np.testing.assert_array_equal(values, whole[name])
-    assert not expected & flatten_dict(saved["params"], sep="/").keys()
-    state = train(6)  # from the checkpoint
-    chex.assert_trees_all_equal(state.frozen, saved["frozen"])
-    assert int(state.step) == 6
-    changed = flatten_dict(dict(state.params), sep="/")
-    assert all((changed[name] != whole[name]).any() for name in changed)
+    for state in (train(6), train(6)):  # from a checkpoint
+        frozen = flatten_dict(dict(state.frozen), sep="/")
+        assert frozen.keys() == {n for n in whole if n.startswith("backbone/encoder_")}
+        for name, values in frozen.items():
+            np.testing.assert_array_equal(values, whole[name])
+        trained = flatten_dict(dict(state.params), sep="/")
+        assert trained.keys() == whole.keys() - frozen.keys()
+        assert all((trained[name] != whole[name]).any() for name in trained)
 
 
-def test_no_more_than_two_steps_are_under_way(
-    run: Any, workdir: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    waited = []
-    wait = loop.jax.block_until_ready
-
-    def spy(metrics: Any) -> Any:
-        waited.append(metrics)
-        return wait(metrics)
-
-    monkeypatch.setattr(loop.jax, "block_until_ready", spy)
-    run(workdir)
-    # That of the first step, and those of two steps before from the third on.
-    losses = [float(m["focal"]) for m in waited if isinstance(m, dict)]
-    first, expected = losses[0], [v for _, v in _losses(workdir)]
-    assert [first, *losses[1:]] == pytest.approx([expected[0], *expected[:6]])
-
-
-def test_a_corrupted_newest_checkpoint_falls_back(
-    run: Any,
-    undisturbed: Any,
-    finished: pathlib.Path,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_a_corrupted_newest_checkpoint_falls_back(run, undisturbed, finished, caplog):
     for path in (finished / "checkpoints/8/state").rglob("*"):
         if path.is_file():
             path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
@@ -277,8 +216,8 @@ def test_a_corrupted_newest_checkpoint_falls_back(
     ("first", "then"), [pytest.param(4, 1, marks=pytest.mark.slow), (1, 4)]
 )
 def test_a_state_comes_back_bit_for_bit_on_another_number_of_devices(
-    first: int, then: int, undisturbed: Any, tmp_path: pathlib.Path, tiny: Tiny
-) -> None:
+    first, then, undisturbed, tmp_path, tiny
+):
     state = undisturbed[0][0]
 
     def placed(count: int) -> Any:
@@ -301,8 +240,8 @@ def test_a_state_comes_back_bit_for_bit_on_another_number_of_devices(
 
 
 def test_steps_without_finite_loss_are_named_and_end_the_run(
-    run: Any, tiny: Tiny, workdir: pathlib.Path, caplog: pytest.LogCaptureFixture
-) -> None:
+    run, tiny, workdir, caplog
+):
     class Poisoned(Stopping):
         def __next__(self) -> Any:
             batch = super().__next__()
@@ -329,36 +268,37 @@ def test_steps_without_finite_loss_are_named_and_end_the_run(
             run(workdir / "most", loader, config=config)
 
 
-def test_evaluation_on_the_way_is_logged_and_the_best_kept(
-    run: Any, tiny: Tiny, workdir: Any
-) -> None:
-    changes = {"evaluate_every_epochs": 1, "num_epochs": 4, "checkpoints_to_keep": 1}
-    config = tiny.config.replace(train=changes)
-
-    values = iter((1.5, 3.5, 2.5, 2.0))
+def test_evaluation_on_the_way_is_logged_and_the_best_kept(run, tiny, workdir):
+    """A run of a given number of steps, which is not a multiple of those of an epoch."""
+    config = tiny.config.replace(
+        train={"evaluate_every_epochs": 1, "max_steps": 8, "checkpoints_to_keep": 1}
+    )
+    values = iter((1.5, 3.5, 2.5))
+    name = "validation/ap_bev_iou30/exact"
 
     def evaluate(_: Any, should_stop: Any) -> Scores:
         best = next(values)
-        return Scores({"validation/ap_bev_iou30/exact": best}, best, {"a": Figure()})
+        return Scores({name: best}, best, {"a": Figure()})
 
-    run(workdir, config=config, validate=evaluate, steps_per_epoch=2)
-    rows = map(json.loads, (workdir / "metrics.jsonl").read_text().splitlines())
-    rows = list(rows)
-    name = "validation/ap_bev_iou30/exact"
-    assert [row[name] for row in rows if name in row] == [1.5, 3.5, 2.5, 2.0]
-    schedule = make_schedule(config.train, 2)
+    options = {"config": config, "validate": evaluate, "steps_per_epoch": 3}
+    state, is_finished = run(workdir, **options)
+    assert (int(state.step), is_finished) == (8, True)
+    lines = (workdir / "metrics.jsonl").read_text().splitlines()
+    rows = [json.loads(line) for line in lines]
+    logged = [(row["step"], row[name]) for row in rows if name in row]
+    assert logged == [(3, 1.5), (6, 3.5), (8, 2.5)]
+    schedule = make_schedule(config.train, 3)
     rates = {row["step"]: row["learning_rate"] for row in rows if "focal" in row}
     assert rates == {step: pytest.approx(float(schedule(step - 1))) for step in rates}
     assert len(set(rates.values())) > 1
     with Checkpoints(workdir / "checkpoints", read_only=True) as checkpoints:
-        assert checkpoints.steps() == [4, 8]
-        assert checkpoints.best_step() == 4
+        assert checkpoints.steps() == [6, 8]
+        assert checkpoints.best_step() == 6
+    check_equal(run(workdir, **options), ((state, True), workdir))  # nothing is left
 
 
 @pytest.mark.slow
-def test_a_trace_is_written(
-    run: Any, workdir: pathlib.Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_trace_is_written(run, workdir, caplog):
     run(workdir, profile=str(workdir / "trace"))
     assert list((workdir / "trace").rglob("*.xplane.pb"))
     run(workdir, profile=str(workdir / "none"))
@@ -366,9 +306,7 @@ def test_a_trace_is_written(
 
 
 @pytest.mark.parametrize("setting", ["jax_debug_nans", "jax_disable_jit"])
-def test_debugging_works(
-    tiny: Tiny, tmp_path: pathlib.Path, one_device: jax.sharding.Mesh, setting: str
-) -> None:
+def test_debugging_works(tiny, tmp_path, one_device, setting):
     """Operations that run one at a time transfer their arguments to the device.
 
     NaN is found in the second call too, after JAX turned the check off while it traced

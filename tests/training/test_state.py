@@ -1,9 +1,9 @@
 """Schedule and optimizer against numbers worked out by hand and torch's AdamW rule."""
 
-from types import SimpleNamespace
 from typing import Any
 
 import chex
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -43,7 +43,6 @@ CYCLIC = {"schedule": "cyclic_cosine", "final_learning_rate": 1e-5}
             (0, 5, 10, 55, 100),
             (0, 5e-4, 1e-3, 5.5e-4, 1e-4),
         ),
-        (_schedule(50, 9, max_steps=100), (0, 50, 100), (1e-3, 5.5e-4, 1e-4)),
         (_schedule(50, 1, max_steps=100), (0, 50, 100), (1e-3, 5.5e-4, 1e-4)),
         (_schedule(10, 6, max_steps=20, **CYCLIC), (0, 10, 20), (1e-3, 1e-5, 1e-3)),
         (
@@ -53,7 +52,7 @@ CYCLIC = {"schedule": "cyclic_cosine", "final_learning_rate": 1e-5}
         ),
     ],
 )
-def test_rates_by_step(schedule: Any, steps: tuple, rates: tuple) -> None:
+def test_rates_by_step(schedule, steps, rates):
     np.testing.assert_allclose([float(schedule(x)) for x in steps], rates, rtol=1e-5)
 
 
@@ -72,8 +71,8 @@ def _torch_recursion(peak: float, floor: float, period: int, steps: int) -> np.n
 
 
 # One batch an epoch, odd and even numbers, those of K-Radar in both recipes.
-@pytest.mark.parametrize("steps_per_epoch", [1, 2, 3, 7, 10, 1745, 2909])
-def test_cyclic_cosine_is_torchs_recursion_at_every_step(steps_per_epoch: int) -> None:
+@pytest.mark.parametrize("steps_per_epoch", [1, 2, 7, 1745])
+def test_cyclic_cosine_is_torchs_recursion_at_every_step(steps_per_epoch):
     num_steps = 11 * steps_per_epoch
     schedule = _schedule(steps_per_epoch, 11, **CYCLIC)
     rates = np.asarray(jax.jit(schedule)(jnp.arange(num_steps)))
@@ -85,16 +84,7 @@ def test_cyclic_cosine_is_torchs_recursion_at_every_step(steps_per_epoch: int) -
     assert len(floors) == 5
 
 
-def test_warm_up_longer_than_the_training_is_rejected() -> None:
-    with pytest.raises(
-        UserError, match=r"warmup_steps is 100, expected less than the 100"
-    ):
-        _schedule(50, 2, warmup_steps=100)
-
-
-def test_accumulated_steps_update_once_with_the_mean_and_at_the_rate_of_their_step() -> (
-    None
-):
+def test_accumulated_steps_update_once_with_the_mean_and_at_the_rate_of_their_step():
     rates = jnp.array([0.0, 1e-3, 2e-3, 3e-3])
     params, grads = {"w": jnp.array([2.0])}, [jnp.array([1.0]), jnp.array([3.0])]
     train = TrainOptions(weight_decay=0.1, gradient_accumulation_steps=2)
@@ -110,7 +100,7 @@ def test_accumulated_steps_update_once_with_the_mean_and_at_the_rate_of_their_st
     chex.assert_trees_all_close(updates, wanted, rtol=1e-6)
 
 
-def test_first_step_is_adamw_with_torch_defaults() -> None:
+def test_first_step_is_adamw_with_torch_defaults():
     optimizer = make_optimizer(TrainOptions(), lambda _: 1e-3)
     params = {"kernel": jnp.array([2.0, -3.0]), "bias": jnp.array([0.5])}
     grads = {"kernel": jnp.array([0.1, 4.0]), "bias": jnp.array([-1.0])}
@@ -125,88 +115,93 @@ def test_first_step_is_adamw_with_torch_defaults() -> None:
     )
 
 
-def test_frozen_parameters_have_no_update_and_no_optimizer_state() -> None:
+class WithFrozenPart(nn.Module):
+    def is_frozen(self, path):
+        return path.startswith("vit/")
+
+
+def test_frozen_parameters_have_no_optimizer_state_and_no_average():
     optimizer = make_optimizer(TrainOptions(weight_decay=0.1), lambda _: 1e-3)
     params = {
         "vit": {"kernel": jnp.ones((7, 5))},
         "head": {"kernel": jnp.ones((3,)), "fixed": jnp.ones((2,))},
     }
     state = create_state(
-        {"params": params},
+        {"params": params, "batch_stats": {"mean": jnp.zeros(2)}},
         optimizer,
         use_ema=True,
-        is_frozen=lambda name: name.startswith("vit/") or name == "head/fixed",
+        is_frozen=freezing(WithFrozenPart(), ("head/fix*",)),
     )
     assert jax.tree.leaves(jax.tree.map(jnp.shape, state.params)) == [3]
     for part in (state.opt_state, state.ema_params):
         assert {x.shape for x in jax.tree.leaves(part)} <= {(3,), ()}
     chex.assert_trees_all_equal(state.eval_variables["params"], params)
-    chex.assert_trees_all_equal(
-        merge_parameters(*split_parameters(params, None)), params
-    )
+    averaged = state.replace(ema_params=jax.tree.map(lambda x: 5 * x, state.ema_params))
+    found = averaged.eval_variables
+    assert found["params"]["head"]["kernel"][0] == 5.0
+    assert found["params"]["head"]["fixed"][0] == 1.0
+    assert "batch_stats" in found
+
+
+def test_patterns_are_of_parameters_or_of_whole_parts():
+    params = {"backbone": {"encoder_1": 1, "decoder_1": 2}, "image": {"w": 3}}
+    for patterns, frozen in (
+        ((), {}),
+        (("backbone",), {"backbone": params["backbone"]}),
+        (
+            ("backbone/enc*", "image/w"),
+            {"backbone": {"encoder_1": 1}, "image": {"w": 3}},
+        ),
+    ):
+        parts = split_parameters(params, freezing(WithFrozenPart(), patterns))
+        assert parts[1] == frozen
+        assert merge_parameters(*parts) == params
+
+
+PARAMS = {"backbone": {"w": 1}, "image": {"w": 3}}
+
+
+def _schedule_of(name: str) -> Any:
+    return make_schedule(TrainOptions(num_epochs=1, schedule=name), 5)
 
 
 @pytest.mark.wrong_types
-def test_patterns_freeze_in_addition_to_the_model() -> None:
-    params = {"backbone": {"encoder_1": 1, "decoder_1": 2}, "image": {"w": 3}}
-    own = SimpleNamespace(is_frozen=lambda path: path.startswith("image/"))
-    is_frozen = freezing(own, ("backbone/encoder*",))
-    trained, frozen = split_parameters(params, is_frozen)
-    assert trained == {"backbone": {"decoder_1": 2}}
-    assert frozen == {"backbone": {"encoder_1": 1}, "image": {"w": 3}}
-    assert merge_parameters(trained, frozen) == params
-    assert split_parameters(params, freezing(SimpleNamespace(), ()))[0] == params
-    of_part = freezing(SimpleNamespace(), ("backbone",))
-    assert split_parameters(params, of_part)[0] == {"image": {"w": 3}}
-    check_patterns(params, ("backbone/*",))
-    with pytest.raises(
-        UserError,
-        match=r"'neck\*', .*: backbone/decoder_1, backbone/encoder_1, image/w$",
-    ):
-        check_patterns(params, ("image*", "neck*"))
-    with pytest.raises(UserError, match="expected patterns that leave parameters"):
-        check_patterns(params, ("*",))
-
-
-def _made(fields: dict[str, str]) -> None:
-    train = TrainOptions(num_epochs=1, **fields)
-    make_optimizer(train, make_schedule(train, 5))
-
-
 @pytest.mark.parametrize(
-    ("fields", "message"),
+    ("call", "message"),
     [
         (
-            {"optimizer": "lion"},
-            "optimizer is 'lion', expected adamw or module:function",
+            lambda: make_optimizer(TrainOptions(optimizer="lion"), lambda _: 1e-3),
+            r"config\.train\.optimizer is 'lion', expected adamw or module:function",
         ),
         (
-            {"optimizer": "builtins:print"},
+            lambda: make_optimizer(TrainOptions(optimizer="builtins:print"), abs),
             "expected a function that returns an optax.Grad",
         ),
-        ({"optimizer": "optax:no"}, "module 'optax' has no attribute 'no'"),
-        ({"schedule": "linear"}, "expected cosine or cyclic_cosine or module:function"),
         (
-            {"schedule": "sys:path"},
-            "schedule is 'sys:path', expected the name of a func",
+            lambda: _schedule_of("linear"),
+            "expected cosine or cyclic_cosine or module:f",
         ),
+        (
+            lambda: _schedule_of("sys:path"),
+            "is 'sys:path', expected the name of a func",
+        ),
+        (
+            lambda: _schedule(50, 2, warmup_steps=100),
+            "warmup_steps is 100, expected less than the 100",
+        ),
+        (
+            lambda: check_patterns(PARAMS, ("image*", "neck*")),
+            r"'neck\*', .*: backbone/w, image/w$",
+        ),
+        (lambda: check_patterns(PARAMS, ("*",)), "patterns that leave parameters"),
     ],
 )
-def test_wrong_optimizers_and_schedules_are_named(fields: Any, message: str) -> None:
-    with pytest.raises(UserError, match=rf"^config\.train\..*{message}"):
-        _made(fields)
+def test_wrong_options_are_named(call, message):
+    with pytest.raises(UserError, match=message):
+        call()
 
 
-def test_eval_variables_are_the_averaged_ones_where_there_are_any() -> None:
-    optimizer = make_optimizer(TrainOptions(weight_decay=0.0), lambda _: 1e-3)
-    variables = {"params": {"w": jnp.ones(2)}, "batch_stats": {"mean": jnp.zeros(2)}}
-    state = create_state(variables, optimizer, use_ema=True)
-    state = state.replace(ema_params={"w": jnp.full(2, 5.0)})
-    assert state.eval_variables["params"]["w"][0] == 5.0
-    assert "batch_stats" in state.eval_variables
-
-
-def test_pretrained_parts_replace_their_like() -> None:
+def test_pretrained_parts_replace_their_like():
     proj = {"kernel": np.ones((3, 8)), "bias": np.zeros(8)}
     variables = {"params": {"image_neck": {"proj": proj}, "heads": {}}}
     part = {"params": {"image_neck": {"proj": {"bias": np.full(8, 7.0)}, "new": 1}}}

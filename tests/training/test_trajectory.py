@@ -42,7 +42,7 @@ Measured = dict[str, np.ndarray]
 
 
 @pytest.fixture(scope="module")
-def frames(shared: pathlib.Path) -> Batch:
+def frames(shared):
     """The six frames, float32 as the fixture's network sees them."""
     recipe = load_module(shared / "fixtures" / "trajectory_recipe.py")
     objects, cubes = recipe.frames(SEED), recipe.cubes(SEED)
@@ -139,9 +139,7 @@ def check_stats(
 
 @pytest.mark.slow  # twelve steps of the full network: 8 processor minutes, 8 GiB
 @pytest.mark.timeout(3000)
-def test_radenet_trains_as_released(
-    shared: pathlib.Path, frames: Batch, make: types.ModuleType
-) -> None:
+def test_radenet_trains_as_released(shared, frames, make):
     config = load_config("radenet:official")
     model = models.build(config.model)
     tensors = {
@@ -215,9 +213,7 @@ NO_GRADIENT = [f"image_neck.{n}.0.bias" for n in ("fpn_layer1", "fpn_layer2", "r
 
 @pytest.mark.slow  # six ViT-S/16 and four steps of all: 6 processor minutes, 8 GiB
 @pytest.mark.timeout(3000)
-def test_dinorade_trains_as_released(
-    shared: pathlib.Path, frames: Batch, make: types.ModuleType
-) -> None:
+def test_dinorade_trains_as_released(shared, frames, make):
     config = load_config("dinorade:official")
     # The fixture's settings where they are not the release's.
     config = config.replace(
