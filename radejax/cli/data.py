@@ -37,7 +37,9 @@ def _echo_report(report: PreprocessReport) -> None:
 )
 @entry.out_folder("Root of the new dataset.")
 @click.option("--seed", type=click.IntRange(0), help="Replaces the config's seed.")
-@click.option("--scenes", help='"procedural", or a label folder or zip of K-Radar.')
+@click.option(
+    "--scenes", help='"procedural", a CSV file, or a label folder or zip of K-Radar.'
+)
 @entry.sequences
 @click.option(
     "--frames",

@@ -126,7 +126,8 @@ class SimulationOptions(Options, section="config.simulation"):
     seed: Count = 0
     """Seed of all random numbers."""
     scenes: str = "procedural"
-    """procedural, or the path of a K-Radar label folder or zip."""
+    """procedural; the path of a CSV file of own scenes, of which all frames are simulated; or
+    that of a K-Radar label folder or zip."""
     # Many short sequences, as the frames of one sequence resemble each other: a network
     # learns more from 20 roads for 2 seconds than from 10 roads for 4 seconds.
     train_sequences: Count = 20
@@ -202,11 +203,23 @@ class SimulationOptions(Options, section="config.simulation"):
         else:
             is_one = self.vru_density_scale == 1
             self._require(is_one, "vru_density_scale", "1 for scenes of real labels")
+        if self.is_own:
+            is_whole = self.frames_per_sequence in (
+                0,
+                20,
+            )  # the default is that of others
+            all_frames = "0, all frames of a CSV file"
+            self._require(is_whole, "frames_per_sequence", all_frames)
         self.make_grid()
         return self
 
     def _require(self, holds: bool, name: str, expected: str) -> None:
         require(holds, f"config.simulation.{name}", getattr(self, name), expected)
+
+    @property
+    def is_own(self) -> bool:
+        """Whether the scenes are those of a CSV file."""
+        return self.scenes.lower().endswith(".csv")
 
     def make_grid(self) -> RadarGrid:
         """Returns the axes of the radar tensor.

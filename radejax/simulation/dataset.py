@@ -11,6 +11,7 @@ from __future__ import annotations
 import collections
 import contextlib
 import functools
+import hashlib
 import itertools
 import json
 import logging
@@ -160,11 +161,15 @@ def _count(root: pathlib.Path) -> dict[str, int]:
 
 def _marker(options: SimulationOptions) -> files.JsonObject:
     """Returns the content of the marker file of an unfinished dataset."""
-    return {
+    content: files.JsonObject = {
         "config": json.loads(options.to_json()),
         "finished": False,
         "fingerprint": options.fingerprint(),
     }
+    if options.is_own:  # the file may have changed
+        scenes = files.read_text(options.scenes).encode()
+        content["scenes_sha256"] = hashlib.sha256(scenes).hexdigest()
+    return content
 
 
 class Writer:

@@ -7,18 +7,19 @@ them. It creates the scene of each sequence on request, procedurally or from lab
 from __future__ import annotations
 
 import collections
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt32
 
-from radejax.core.errors import UserError
+from radejax.core.errors import UserError, require
 from radejax.data.kradar import Frame, KRadar
 from radejax.data.kradar.folders import split_by_rule
 from radejax.data.kradar.labels import Label, LabelHeader
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.radar import propagation, scattering, sensor, tensor
-from radejax.simulation.world import scene
+from radejax.simulation.world import own_scenes, scene
 from radejax.simulation.world.replay import make_real_sequence
 from radejax.simulation.world.scene import SceneFrame, Sequence
 from radejax.simulation.world.traffic import make_sequence
@@ -221,25 +222,43 @@ class ProceduralSource:
 
 
 class LabelSource:
-    """Source of the sequences in a K-Radar label folder or zip, with K-Radar's split."""
+    """Source of the sequences in a K-Radar label folder or zip, with K-Radar's split.
+
+    Or of the sequences in a CSV file of own scenes, with all of their frames.
+    """
 
     def __init__(self, options: SimulationOptions) -> None:
+        shift_m = options.radar_from_lidar_m
+        data: Iterable[Frame]
+        if options.is_own:
+            options = options.replace(frames_per_sequence=0)
+            data = own_scenes.read_frames(options.scenes, shift_m)
+        else:
+            # Objects outside the field of view are kept, as they can block other objects
+            # and appear in images.
+            data = KRadar(
+                labels=options.scenes,
+                version=options.label_version,
+                visibility=None,
+                field_of_view=False,
+                sequence_numbers=options.sequences,
+            )
         self._options = options
-        # Objects outside the field of view are kept, as they can block other objects and
-        # appear in images.
-        data = KRadar(
-            labels=options.scenes,
-            version=options.label_version,
-            visibility=None,
-            field_of_view=False,
-            sequence_numbers=options.sequences,
-        )
         self._frames: dict[int, list[Frame]] = collections.defaultdict(list)
         for frame in data:
-            self._frames[frame.sequence].append(frame)
-        if not self._frames:
-            raise UserError(f"{options.scenes}: no frames of the chosen sequences")
+            if not options.sequences or frame.sequence in options.sequences:
+                self._frames[frame.sequence].append(frame)
         self.numbers = sorted(self._frames)
+        if not self.numbers or set(options.sequences or ()) - set(self.numbers):
+            raise UserError(
+                f"{options.scenes}: no frames in some of {options.sequences}"
+            )
+        for number in self.numbers:
+            _, time, weather = self.conditions(number)
+            is_known = time in ("day", "night") and weather in propagation.WEATHERS
+            name = f"{options.scenes}: time, weather of {number}/description.txt"
+            expected = f"day or night, and one of {', '.join(propagation.WEATHERS)}"
+            require(is_known, name, f"{time},{weather}", expected)
 
     def conditions(self, number: int) -> scene.Conditions:
         """Returns environment, time and weather of the sequence `number`."""

@@ -73,12 +73,14 @@ class Frame(LabelledFrame):
         projection_path: File of the `.npy` projection of the reference implementation,
             or of a reduced release, or None if it is missing. It is the `radar_path` if
             the tensor is missing.
+        ego_speed_mps: Speed of the radar over ground, or None as in all label files.
     """
 
     header: LabelHeader
     labels: tuple[Label, ...]
     tesseract_path: pathlib.Path | None
     projection_path: pathlib.Path | None
+    ego_speed_mps: float | None = None
 
     @property
     def visibility(self) -> Shaped[np.ndarray, " N"]:
@@ -378,7 +380,9 @@ def _read_sequence(index: Index, number: int, summary: Summary) -> _Sequence:
         counts["sequences with the default calibration"] += 1
         calibration = (0, *RADAR_FROM_LIDAR_M[:2])
     _, dx_m, dy_m = calibration
+    names = [f"{number}/description.txt", f"{number:02d}/description.txt"]
     path = folder.find(".", "description.txt")
+    path = path or folders.first_file(index.split_folders, names)
     read_description = conditions.read_description
     found = _read_or_report(read_description, path, "description", summary)
     if found is None:

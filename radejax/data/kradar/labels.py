@@ -106,12 +106,15 @@ class Label:
             the LiDAR only, `L1` if this was not judged. All objects of versions without
             the flag (v1.0, v2.0) have `R`.
         track_id: Identity within the sequence.
+        velocity_mps: x and y of the velocity relative to the radar, or None as in all
+            label files.
     """
 
     cls: str
     box: tuple[float, float, float, float, float, float, float]
     visibility: str = "R"
     track_id: int = -1
+    velocity_mps: tuple[float, float] | None = None
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -109,6 +109,11 @@ ENVIRONMENTS = {
 }  # fmt: skip
 """K-Radar's eight road types."""
 
+SURROUNDINGS = ENVIRONMENTS | {
+    "indoor": Environment((0.0, 0.0), walls=1.0, wall_m=0.5, trees_per_100m=0.0)
+}
+"""Those of own scenes: K-Radar's road types, or floor and walls."""
+
 # Mean and standard deviation of the radar cross-section of each kind of reflector in dBsm.
 _DBSM = {
     "ground": (-24.0, 5.0),

@@ -27,7 +27,8 @@ def make_real_sequence(
     """Creates a scene from the labels of one sequence.
 
     Args:
-        frames: Consecutive frames of one sequence in order, with all their labels.
+        frames: Consecutive frames of one sequence in order, with all their labels. If they
+            have the speed of the radar, their ground is at the lower sides of the boxes.
         radar_from_lidar_m: Translation in meters from LiDAR to radar positions.
         rng: Random generator for the surroundings.
 
@@ -36,13 +37,21 @@ def make_real_sequence(
     """
     tracks = collect_tracks(frames, radar_from_lidar_m)
     clock = np.array([f.header.timestamp_s for f in frames])
-    relative = relative_velocity(tracks, clock)
+    estimated = relative_velocity(tracks, clock)
+    is_known = np.isfinite(tracks.velocity_mps)
+    relative = np.where(is_known, tracks.velocity_mps, estimated)
     environment = frames[0].environment
-    law = environments.ENVIRONMENTS.get(environment, environments.ENVIRONMENTS["urban"])
-    speed = infer_ego_speed(tracks, relative, law.speed_mps)
+    laws = environments.SURROUNDINGS
+    law = laws.get(environment, laws["urban"])
+    ground = _ground_height(tracks)
+    speeds = [f.ego_speed_mps for f in frames if f.ego_speed_mps is not None]
+    speed = np.array(speeds)
+    if not speeds:
+        speed = infer_ego_speed(tracks, relative, law.speed_mps)
+        # A few boxes on a slope would give a wrong height.
+        ground = float(np.clip(ground, -1.4, -0.4))
     periods = np.diff(clock, append=clock[-1] + scene.FRAME_PERIOD_S).clip(0.02, 1.0)
     along = scene.traveled(speed, periods)
-    ground = _ground_height(tracks)
     edges = _road_edges(tracks, law)
     reflectors, mirrors = environments.make_surroundings(
         law, Road(), along[-1] + environments.SIGHT_M, edges, rng, ground
@@ -70,7 +79,8 @@ def make_real_sequence(
 def collect_tracks(frames: list[Frame], radar_from_lidar_m: Shift) -> Tracks:
     """Collects the labels of all frames as tracks with positions in the radar frame.
 
-    The tracks are those of `motion.number_tracks`.
+    The tracks are those of `motion.number_tracks`. Velocities are those of the labels,
+    relative to the radar, and NaN where they are not known.
     """
     labels = [label for frame in frames for label in frame.labels]
     counts = [len(frame.labels) for frame in frames]
@@ -85,10 +95,13 @@ def collect_tracks(frames: list[Frame], radar_from_lidar_m: Shift) -> Tracks:
     present = np.zeros(boxes.shape[:2], bool)
     present[frame_idx, track_idx] = True
     boxes[..., :3] += radar_from_lidar_m
+    velocity = np.full((*present.shape, 2), np.nan)
+    known = [label.velocity_mps or (np.nan, np.nan) for label in labels]
+    velocity[frame_idx, track_idx] = np.reshape(known, (-1, 2))
     return Tracks(
         position_m=boxes[..., :3],
         yaw_rad=boxes[..., 6],
-        velocity_mps=np.zeros((*present.shape, 2)),
+        velocity_mps=velocity,
         is_present=present,
         size_m=boxes[..., 3:6],
         cls=np.array([scene.class_index(label.cls) for label in first], int),
@@ -137,17 +150,13 @@ def infer_ego_speed(
 
 
 def _ground_height(tracks: Tracks) -> float:
-    """Estimates the height of the ground from boxes near the ego, in the radar frame.
-
-    The result is limited to values near `GROUND_M`, as a few boxes on a slope would give a
-    wrong height.
-    """
+    """Estimates the height of the ground from boxes near the ego, in the radar frame."""
     bottom = tracks.position_m[..., 2] - tracks.size_m[..., 2] / 2.0
     distance = np.hypot(tracks.position_m[..., 0], tracks.position_m[..., 1])
     near = tracks.is_present & (distance < 30.0)
     if not near.any():
         return environments.GROUND_M
-    return float(np.clip(np.median(bottom[near]), -1.4, -0.4))
+    return float(np.median(bottom[near]))
 
 
 def _road_edges(tracks: Tracks, law: environments.Environment) -> tuple[float, float]:

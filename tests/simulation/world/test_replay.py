@@ -156,6 +156,19 @@ class TestWrittenTree:
         all_specs = LabelSource(whole).frames(3)
         assert specs == [s for s in all_specs if s.scene_idx in chosen]
 
+    def test_weather_is_that_of_the_description_beside_the_labels(self, labels_folder):
+        config = make_config(labels_folder)
+        assert LabelSource(config).conditions(7) == ("alleyway", "night", "normal")
+        write.write_description(
+            labels_folder / "7" / "description.txt", "urban", "day", "fog"
+        )
+        assert LabelSource(config).make(7).weather == "fog"
+        (labels_folder / "7").rename(labels_folder / "70")  # not one of K-Radar's
+        assert LabelSource(config).conditions(70) == ("urban", "day", "fog")
+        (labels_folder / "70" / "description.txt").unlink()
+        with pytest.raises(UserError, match=r"70/description.txt is 'unknown,unknown'"):
+            LabelSource(config)
+
     def test_missing_labels_and_unknown_sequences_are_errors(self, labels_folder):
         with pytest.raises(FileNotFoundError, match="No such file"):
             LabelSource(make_config(labels_folder / "nowhere"))
