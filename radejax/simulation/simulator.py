@@ -7,7 +7,6 @@ them. It creates the scene of each sequence on request, procedurally or from lab
 from __future__ import annotations
 
 import collections
-from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -228,21 +227,20 @@ class LabelSource:
     """
 
     def __init__(self, options: SimulationOptions) -> None:
-        shift_m = options.radar_from_lidar_m
-        data: Iterable[Frame]
         if options.is_own:
             options = options.replace(frames_per_sequence=0)
-            data = own_scenes.read_frames(options.scenes, shift_m)
+            data = own_scenes.read_frames(options.scenes, options.radar_from_lidar_m)
         else:
             # Objects outside the field of view are kept, as they can block other objects
             # and appear in images.
-            data = KRadar(
+            labels = KRadar(
                 labels=options.scenes,
                 version=options.label_version,
                 visibility=None,
                 field_of_view=False,
                 sequence_numbers=options.sequences,
             )
+            data = list(labels)
         self._options = options
         self._frames: dict[int, list[Frame]] = collections.defaultdict(list)
         for frame in data:
@@ -250,9 +248,7 @@ class LabelSource:
                 self._frames[frame.sequence].append(frame)
         self.numbers = sorted(self._frames)
         if not self.numbers or set(options.sequences or ()) - set(self.numbers):
-            raise UserError(
-                f"{options.scenes}: no frames in some of {options.sequences}"
-            )
+            raise UserError(f"{options.scenes}: no frames of {options.sequences}")
         for number in self.numbers:
             _, time, weather = self.conditions(number)
             is_known = time in ("day", "night") and weather in propagation.WEATHERS

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import PathLike, read_text
 
-WEATHERS = ("normal", "overcast", "fog", "rain", "sleet", "lightsnow", "heavysnow")
+Weather = Literal[
+    "normal", "overcast", "fog", "rain", "sleet", "lightsnow", "heavysnow"
+]
+WEATHERS: tuple[str, ...] = get_args(Weather)
 
 # Environment, time and weather of sequences 1 to 58, as published by K-Radar.
 _CONDITIONS = {

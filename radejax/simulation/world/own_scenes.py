@@ -17,6 +17,7 @@ from radejax.core import files
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.options import Options, Positive
 from radejax.data.kradar import Frame
+from radejax.data.kradar.conditions import Weather
 from radejax.data.kradar.labels import Label, LabelHeader
 from radejax.simulation.world import scene
 from radejax.simulation.world.replay import Shift
@@ -27,9 +28,6 @@ _Surroundings = Literal[
     "urban", "highway", "alleyway", "university", "countryside", "mountain",
     "parkinglots", "shoulder", "indoor",
 ]  # fmt: skip
-_Weather = Literal[
-    "normal", "overcast", "fog", "rain", "sleet", "lightsnow", "heavysnow"
-]
 
 
 class SceneObject(Options, section="column"):
@@ -74,7 +72,7 @@ class SceneObject(Options, section="column"):
     """Surroundings of the sequence: a road type of K-Radar, or indoor for floor and walls."""
     time: Literal["day", "night"] = "day"
     """Time of the sequence."""
-    weather: _Weather = "normal"
+    weather: Weather = "normal"
     """Weather of the sequence, one of K-Radar's."""
 
     @property

@@ -119,7 +119,7 @@ def test_wrong_rows_are_named(lines, message, tmp_path):
 
 def test_wrong_choices_are_errors(tmp_path):
     path = str(write(tmp_path, [HEAD, *ROWS]))
-    with pytest.raises(UserError, match=r"scenes.csv: no frames in some of \(5,\)"):
+    with pytest.raises(UserError, match=r"scenes.csv: no frames of \(5,\)"):
         LabelSource(SimulationOptions(scenes=path, sequences=(5,)))
     with pytest.raises(UserError, match=r"frames_per_sequence is 3, expected 0, all"):
         SimulationOptions(scenes=path, frames_per_sequence=3)
