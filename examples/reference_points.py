@@ -17,6 +17,7 @@ from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 
 from radejax.cli import entry
+from radejax.core.errors import DataError
 from radejax.core.structures import Boxes
 from radejax.data.cameras import read_left_image
 from radejax.data.kradar import read_labels
@@ -97,6 +98,18 @@ def draw(
     return figure, float(np.mean(is_valid)), len(drawn.get_offsets())
 
 
+def read_boxes(path: pathlib.Path, version: str) -> Boxes:
+    """Returns the boxes of a label file in the radar frame."""
+    try:
+        labels = read_labels(path, version)
+    except DataError as error:
+        hint = "labels of another version need --version, such as v1.0"
+        raise DataError(f"{error}; {hint}") from None
+    shift = np.array([*RADAR_FROM_LIDAR_M, 0, 0, 0, 0])
+    boxes = np.array([x.box for x in labels]).reshape(-1, 7) + shift
+    return Boxes.one_frame(boxes, [x.cls for x in labels])
+
+
 FILE = click.Path(exists=True, path_type=pathlib.Path)
 
 
@@ -111,14 +124,9 @@ FILE = click.Path(exists=True, path_type=pathlib.Path)
 def main(image, calibration, label, version, out):
     """Draw reference points and boxes on IMAGE with the camera of CALIBRATION."""
     with entry.exit_codes():
+        ground_truth = None if label is None else read_boxes(label, version)
         camera = CameraCalibration.from_kradar(calibration)
         pixels = read_left_image(image, (camera.height, camera.width))
-        ground_truth = None
-        if label is not None:
-            labels = read_labels(label, version)
-            shift = np.array([*RADAR_FROM_LIDAR_M, 0, 0, 0, 0])
-            boxes = np.array([x.box for x in labels]).reshape(-1, 7) + shift
-            ground_truth = Boxes.one_frame(boxes, [x.cls for x in labels])
         figure, inside, count = draw(pixels, camera, ground_truth)
         save_figure(figure, out)
         click.echo(f"{inside:.1%} of the queries are in view; drew {count} in {out}")
