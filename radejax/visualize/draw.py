@@ -467,7 +467,9 @@ def _add_legend(
         handles.append(line)
     terms = []
     if scene.score_threshold is not None and scene.predictions is not None:
-        terms.append(f"score ≥ {scene.score_threshold:g}")
+        scores = scene.predictions.score
+        least = 1.0 if scores is None else float(scores.min(initial=1.0))
+        terms.append(f"score ≥ {min(scene.score_threshold, round(least, 4)):g}")
     if scene.matches is not None:
         terms.append(f"IoU > {scene.matches.iou:g}")
     if terms:

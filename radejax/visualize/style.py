@@ -101,7 +101,8 @@ class Scene:
         image: `[H, W, 3]` left front camera image, uint8 or float in [0, 1], or None.
         camera: Calibration of the image, with which boxes are drawn on it; or None.
         title: Title, such as sequence, frame and weather.
-        score_threshold: Score threshold of the predictions for the legend, or None.
+        score_threshold: Score threshold of the predictions for the legend, which names the
+            lowest score instead if it is below; or None.
         time_s: Seconds since the Unix epoch for recordings, or None.
         lidar_m: LiDAR points `[N, 3]` in the radar frame in meters, drawn on ground plane and
             image; or None.

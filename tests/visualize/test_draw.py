@@ -96,6 +96,17 @@ def test_bev_shows_boxes_headings_region_and_legend():
     assert draw.POWER_LABEL in labels
 
 
+@pytest.mark.parametrize(
+    ("score", "expected"),
+    [(0.07, "score ≥ 0.07"), (0.15, "score ≥ 0.15"), (0.9, "0.15")],
+)
+def test_the_legend_is_true_of_the_boxes_that_are_drawn(score, expected):
+    found = Boxes.one_frame([20.0, -3.0, 0, 4, 2, 1.5, 0], ["Sedan"], [score])
+    figure = draw.draw_frame(scene(predictions=found, score_threshold=0.15))
+    *_, last = figure.legends[0].get_texts()
+    assert last.get_text().endswith(expected)
+
+
 def test_outcomes_have_their_own_colors_and_labels_do_not_overlap():
     x_m = np.array([10.0, 16.0, 22.0, 30.0])
     box = np.tile([0.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0], (4, 1))
