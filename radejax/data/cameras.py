@@ -30,6 +30,8 @@ _log = logging.getLogger(__name__)
 IMAGE_SIZE = (720, 1280)
 """Height and width of the left half of K-Radar's 2560 x 720 stereo images."""
 
+_MAX_STRETCH = 0.02  # of the aspect ratio of images that were resized
+
 
 def read_left_image(
     path: pathlib.Path,
@@ -49,8 +51,8 @@ def read_left_image(
             these images is a stereo pair.
 
     Raises:
-        DataError: The file is corrupted, or the image has another size and `resize` is
-            False.
+        DataError: The file is corrupted, the image has another size and `resize` is
+            False, or another aspect ratio than the calibration.
     """
     from PIL import Image
 
@@ -70,6 +72,15 @@ def read_left_image(
         high, wide = calibrated_size or size
         is_pair = found[0] * high > math.sqrt(2) * wide * found[1]
         left = (0, 0, found[0] // 2 if is_pair else found[0], found[1])
+        if (
+            calibrated_size
+            and abs(left[2] * high / (wide * left[3]) - 1) > _MAX_STRETCH
+        ):
+            raise DataError(
+                f"{path}: {left[2]} x {left[3]} pixels, but its camera calibration is for "
+                f"{wide} x {high}, of another aspect ratio: give width, height and intrinsics "
+                "of the image as it is stored"
+            )
         if file.mode.startswith("I"):  # 16 bits, which Pillow would clip to 255
             levels = np.asarray(file) >> 8
             image = Image.fromarray(levels.astype(np.uint8)).convert("RGB")
@@ -126,8 +137,10 @@ def front_view(
     camera = None
     if frame.camera_calibration_path is not None:
         camera = frame.read_calibration()
-    size = IMAGE_SIZE if camera is None else (camera.height, camera.width)
-    return read_left_image(frame.camera_path, size, resize=True), camera
+    size = None if camera is None else (camera.height, camera.width)
+    return read_left_image(
+        frame.camera_path, size or IMAGE_SIZE, resize=True, calibrated_size=size
+    ), camera
 
 
 # Inputs of a model --------------------------------------------------------------------

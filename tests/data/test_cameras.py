@@ -132,6 +132,19 @@ def test_left_half_of_the_stereo_pair(tmp_path):
         read_left_image(path, resize=True)
 
 
+def test_a_calibration_of_images_of_another_shape_is_named(tmp_path):
+    path = tmp_path / "a.png"
+    sizes = {"resize": True, "calibrated_size": (36, 64)}
+    for width in (128, 256):  # one image, and a pair
+        Image.new("RGB", (width, 72)).save(path)
+        assert read_left_image(path, (18, 32), **sizes).shape == (18, 32, 3)
+    Image.new("RGB", (96, 72)).save(path)
+    with pytest.raises(
+        DataError, match=r"a\.png: 96 x 72 pixels, .* is for 64 x 36, of another aspect"
+    ):
+        read_left_image(path, (18, 32), **sizes)
+
+
 def test_gray_levels_of_16_bits_are_divided_by_256(tmp_path):
     levels = (np.arange(64 * 32).reshape(32, 64) * 32).astype(np.uint16)
     Image.fromarray(levels).save(tmp_path / "a.png")
