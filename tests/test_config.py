@@ -41,6 +41,7 @@ WHOLE = load_config("quickstart_fusion").with_fields(
         "data.camera_calibration": "x",
         "data.release": "rpc",
         "data.num_threads": 1,
+        "data.random_gain_db": 3.0,
         "data.label_permutation_seed": 1,
         "data.camera.radar_from_lidar_m": (-2.5, 0.3, 0.7),
         "data.camera.radar_from_lidar_z_m": 0.7,

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int, Real
 
 from radejax.core.errors import UserError, require
+from radejax.data.projection import LOG_SCALE_DB, decode, encode
 from radejax.geometry.camera import Camera
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -46,6 +47,7 @@ class Augmentation:
     Attributes:
         grid: Sensor axes of the projections.
         mirror_probability: Probability of swapping left and right.
+        random_gain_db: Largest change of the power, or None.
         others: Functions that are called afterwards in the same way, in their order.
 
     Raises:
@@ -54,6 +56,7 @@ class Augmentation:
 
     grid: RadarGrid
     mirror_probability: float = 0.0
+    random_gain_db: float | None = None
     others: Sequence[Callable[[Sample, np.random.Generator], Sample]] = ()
 
     def __post_init__(self) -> None:
@@ -70,6 +73,8 @@ class Augmentation:
         """Returns the sample or a changed copy of it."""
         if rng.random() < self.mirror_probability:
             sample = mirror(sample)
+        if (limit_db := self.random_gain_db) is not None:
+            sample = change_gain(sample, rng.uniform(-limit_db, limit_db))
         for function in self.others:
             sample = function(sample, rng)
             kind = type(sample).__name__
@@ -77,6 +82,13 @@ class Augmentation:
             name = f"the result of {name} in config.data.augmentation"
             require(isinstance(sample, Sample), name, kind, "a Sample")
         return sample
+
+
+def change_gain(sample: Sample, gain_db: float) -> Sample:
+    """Adds decibels to all power, as a receiver of another gain would."""
+    stored = sample.projection
+    levels = decode(stored) + np.float32(gain_db / LOG_SCALE_DB)
+    return dataclasses.replace(sample, projection=encode(levels, stored.dtype.name))
 
 
 def mirror(sample: Sample) -> Sample:

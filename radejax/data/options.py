@@ -11,7 +11,7 @@ import pydantic
 from annotated_types import Ge, MinLen
 
 from radejax.core.errors import require
-from radejax.core.options import AtLeastOne, Count, Fraction, Options, Seed
+from radejax.core.options import AtLeastOne, Count, Fraction, Options, Positive, Seed
 from radejax.geometry.camera import ImageKind
 from radejax.geometry.radar_grid import AzimuthMapping
 
@@ -112,6 +112,9 @@ class DataOptions(Options, section="config.data"):
     0: the main thread reads them."""
     mirror_probability: Fraction = 0.0
     """Probability of mirroring a frame left to right."""
+    random_gain_db: Positive | None = None
+    """Largest change of the power of a frame in dB, which is drawn for each sample, as of
+    receivers of another gain; None: no change."""
     augmentation: tuple[str, ...] = ()
     """Further augmentations in their order, each module:function."""
     targets: tuple[str, ...] = ()

@@ -264,6 +264,7 @@ class Data:
         augment = Augmentation(
             self.records.grid,
             options.mirror_probability,
+            options.random_gain_db,
             [find_function(place, name) for place in options.augmentation],
         )
         size = train.batch_size // jax.process_count()

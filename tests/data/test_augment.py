@@ -11,11 +11,12 @@ from radejax.core.errors import UserError
 from radejax.data.augment import (
     Augmentation,
     Sample,
+    change_gain,
     mirror,
     mirror_camera,
 )
 from radejax.data.cameras import read_left_image
-from radejax.data.projection import encode
+from radejax.data.projection import LOG_SCALE_DB, decode, encode
 from radejax.geometry.camera import CameraCalibration, project
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -176,3 +177,22 @@ def test_uneven_azimuths_are_mirrored_if_they_are_symmetric(sign):
     tilted = dataclasses.replace(grid, azimuth_rad=azimuth + 0.01)
     with pytest.raises(UserError, match="are not symmetric"):
         Augmentation(tilted, 0.5)
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.uint8])
+def test_gain_shifts_all_levels_by_the_same_decibels(dtype):
+    before = sample(np.zeros((0, 8)), dtype)
+    after = change_gain(before, 18.43)  # a tenth of the scale
+    assert after.projection.dtype == dtype
+    shift = decode(after.projection) - decode(before.projection)
+    np.testing.assert_allclose(shift, 0.1, atol=0.002)
+    augment = Augmentation(GRID, random_gain_db=6.0)
+    rng = np.random.default_rng(0)
+    shifts_db = [
+        float(
+            np.mean(decode(augment(before, rng).projection) - decode(before.projection))
+        )
+        * LOG_SCALE_DB
+        for _ in range(40)
+    ]
+    assert -6.3 < min(shifts_db) < -3.0 < 3.0 < max(shifts_db) < 6.3
