@@ -7,28 +7,34 @@ import re
 import shutil
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import jax
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from PIL import Image
 
+import radejax
 from radejax import models
+from radejax.cli.main import main
 from radejax.config import Config
 from radejax.core.errors import UserError
+from radejax.data.check import check_dataset, check_frames
 from radejax.data.dataset import LabelledFrames, find_reader
 from radejax.data.kradar import KRadar
-from radejax.data.kradar.check import check_dataset
 from radejax.data.options import DataOptions
+from radejax.data.points import cfar_points, percentile_points
 from radejax.data.projection import project_tensor
-from radejax.data.records import preprocess
+from radejax.data.records import Records, preprocess
 from radejax.inference.detect_files import detect_files, find_inputs
 from radejax.inference.detector import Detector
 from radejax.inference.export import export
 from radejax.runs import experiment
 from radejax.runs.data import Data, located
 from radejax.runs.evaluate import evaluate_run
+from radejax.visualize.style import Scene
 
 from . import small_models as small
 from . import toy_reader
@@ -78,7 +84,7 @@ def _config() -> Config:
         data={
             "format": "toy:Toy",
             "targets": ("velocity_mps",),
-            "augmentation": ("parts:random_gain",),
+            "augmentation": ("parts:random_noise",),
         },
         train={
             "batch_size": 2,
@@ -188,6 +194,73 @@ def test_records_of_other_files_or_of_another_reader_are_reported(
         again()
 
 
+def test_commands_read_such_data_by_the_config(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = _write_toy(tmp_path / "toy")
+    config = Config().replace(data={"format": "toy:Toy"}, evaluation={"roi": None})
+    given = ["--config", small.write_config(tmp_path / "config.py", config)]
+
+    def run(*words: object, code: int = 0) -> str:
+        done = CliRunner().invoke(main, [str(word) for word in words])
+        assert done.exit_code == code, done.output
+        return done.output
+
+    report = json.loads(run("data", "check", root, *given, "--deep", "--json"))
+    assert report["version"] == "read by toy:Toy"
+    assert [row["without_camera"] for row in report["sequences"]] == [1, 2]
+    assert [(row["train"], row["test"]) for row in report["sequences"]] == [
+        (2, 0),
+        (0, 2),
+    ]
+    train = {row["split"]: row for row in report["objects"]}["train"]
+    assert (train["Sedan"], report["summary"]["num_problems"]) == (2, 0)
+
+    out = tmp_path / "records"
+    text = run("preprocess", root, *given, "--out", out, "--sequences", 2)
+    assert "2 preprocessed" in text
+    assert Records.open(out).keys() == {"2/0001", "2/0002"}
+
+    grid = small.small_grid()
+    projection = _read_toy(root)[1].read_projection(grid)
+    expected = {
+        "cfar": cfar_points(projection, grid, threshold_db=0.0),
+        "percentile": percentile_points(projection, grid, 0.02),
+    }
+    (block,) = re.findall(r"^```py\n(points = .*?)^```", PAGE.read_text(), re.M | re.S)
+    names = {"frame": _read_toy(root)[1], "GRID": grid}
+    exec(f"from radejax.data.points import *\n{block}", names)
+    found = percentile_points(projection, grid, 0.01)
+    np.testing.assert_array_equal(names["strongest"].x_m, found.x_m)
+    assert len(names["points"].x_m) < len(expected["cfar"].x_m)
+    for method, points in expected.items():
+        out = tmp_path / method
+        words = [f"--method={method}", "--rate=0.02", "--threshold-db=0"]
+        assert "4 prepro" in run("points", root, *given, *words, "--out", out)
+        found = np.load(out / "1" / "rpc_0002.npy")
+        assert len(found)
+        np.testing.assert_allclose(found[:, :3], np.stack(points[:3], axis=1))
+        np.testing.assert_array_equal(found[:, 8:], np.stack(points[5:], axis=1))
+
+    scenes: list[Scene] = []
+    drawn = radejax.draw_frame
+    monkeypatch.setattr(
+        radejax, "draw_frame", lambda scene: scenes.append(scene) or drawn(scene)
+    )
+    out = tmp_path / "a.png"
+    given += ["--data", root, "--out", out]
+    assert run("overlay", "1/0001", *given) == f"drew {out}\n"
+    text = run("overlay", "1/0002", *given)
+    assert "1 of 1 frames have no front image, 0 no camera" in text
+    both, radar = scenes
+    assert both.image is not None
+    assert both.camera is not None
+    assert radar.image is None
+    assert [len(scene.ground_truth or ()) for scene in scenes] == [1, 1]
+    assert "leave it out" in run("overlay", "1/0002", *given, "--lidar", code=2)
+    assert "no frames of these" in run("overlay", "7/0001", *given, code=2)
+
+
 def test_objects_that_cannot_be_learned_are_left_out_and_counted(
     tmp_path: pathlib.Path,
 ) -> None:
@@ -218,6 +291,42 @@ def test_objects_that_cannot_be_learned_are_left_out_and_counted(
     np.savez(path, **content | {"boxes": np.array([[*good[:6], 90.0]] * 5)})
     with pytest.raises(UserError, match=r"frame 1/0001: yaw is 90, expected radians"):
         Data(config)
+
+
+def test_what_a_reader_forgets_is_named(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = _write_toy(tmp_path)
+    toy, classes = importlib.import_module("toy"), ("Sedan",)
+    frames = list(_read_toy(root))
+    grid = small.small_grid()
+    with pytest.raises(
+        UserError, match="number of frames 1/0001 is 2, expected 1: oth"
+    ):
+        toy.Toy([*frames, frames[0]], grid).with_valid_boxes(classes)
+    uncalibrated = [replace(x, camera_calibration_path=None) for x in frames]
+    counts = toy.Toy(uncalibrated, grid).with_valid_boxes(classes).counts
+    name = "frames with a camera_path and no camera_calibration_path: read_calibration "
+    assert counts[f"{name}is not called"] == 1
+
+    # Labels without z and height.
+    flat = replace(frames[0], boxes=np.array([[12.0, 1.0, 4.2, 1.8, 0.1]]))
+    assert flat.boxes.tolist() == [[12.0, 1.0, 0.0, 4.2, 1.8, 1.5, 0.1]]
+
+    # Problems of files that only `data check` and `preprocess` find.
+    decibels = lambda *_: np.full(grid.projection_shape, 0.5, np.float32)  # noqa: E731
+    monkeypatch.setattr(toy.ToyFrame, "read_projection", decibels)
+    report = check_frames(_read_toy(root), classes, [str(root)])
+    first, second = report.to_dict()["summary"]["problems"]
+    assert first.startswith("1/0001: projection: all values are the same")
+    assert second.startswith("2/0001: ")
+    assert "2 problems" in report.to_text()
+    skipped = preprocess(_read_toy(root), tmp_path / "records").skipped
+    assert len(skipped) == 4
+    monkeypatch.setattr(toy.ToyFrame, "read_projection", lambda *_: np.ones((2, 3, 4)))
+    report = check_frames(_read_toy(root), classes, [str(root)], deep=True)
+    assert report.num_problems == 4
+    assert "projection of shape (2, 3, 4), not" in report.summary.problems[0][1]
 
 
 @pytest.mark.parametrize("is_flat", [False, True])

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import pathlib
 import time
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -14,6 +16,9 @@ from radejax.core.errors import DataError, UserError
 from radejax.core.files import read_object
 
 if TYPE_CHECKING:
+    import numpy as np
+
+    from radejax.data.dataset import LabelledFrame
     from radejax.data.records import PreprocessReport
 
 _rate = click.option(
@@ -114,7 +119,7 @@ def simulate(
 
 @click.group()
 def data() -> None:
-    """Inspect a K-Radar copy."""
+    """Inspect a dataset."""
 
 
 @data.command(cls=entry.Command)
@@ -123,16 +128,30 @@ def data() -> None:
 @entry.camera_calibration
 @click.option("--deep", is_flag=True, help="Read every radar tensor completely.")
 @entry.json_option
-def check(roots: tuple[str, ...], as_json: bool, **options: Any) -> None:
+def check(
+    roots: tuple[str, ...],
+    config: str | None,
+    deep: bool,
+    as_json: bool,
+    **options: Any,
+) -> None:
     """Report what is there, and what is missing, corrupted or implausible.
 
     Exit code 1 if anything is missing, corrupted or implausible.
 
     Example: radejax data check /disk1/kradar /disk2/kradar
     """
-    from radejax.data.kradar.check import check_dataset
+    from radejax.data import check as checks
+    from radejax.data.options import DataOptions
 
-    report = check_dataset(roots, progress=not as_json, **options)
+    how = {"deep": deep, "progress": not as_json}
+    if config is None:
+        options["version"] = options["version"] or DataOptions().label_version
+        report = checks.check_dataset(roots, **how, **options)
+    else:
+        frames = entry.read_frames(roots, config, **options)
+        classes = radejax.load_config(config).classes
+        report = checks.check_frames(frames, classes, roots, **how)
     entry.echo_result(as_json, report.to_dict(), report.to_text())
     if report.num_problems:
         raise SystemExit(entry.FAILED)
@@ -166,6 +185,7 @@ def _shard(text: str) -> tuple[int, int]:
 def preprocess(
     roots: tuple[str, ...],
     out: pathlib.Path,
+    config: str | None,
     dtype: str | None,
     num_workers: int | None,
     shard: tuple[int, int],
@@ -180,7 +200,7 @@ def preprocess(
     """
     from radejax.data import records
 
-    frames = radejax.KRadar(roots, **part)
+    frames = entry.read_frames(roots, config, **part)
     click.echo(frames.summary().to_text(), err=True)
     report = records.preprocess(
         frames, out, dtype=dtype, shard=shard, num_workers=num_workers
@@ -226,8 +246,10 @@ def reduce(roots: tuple[str, ...], out: pathlib.Path, **options: Any) -> None:
     "--method",
     type=click.Choice(["percentile", "cfar"]),
     default="percentile",
-    help="percentile: the strongest cells. cfar: bins that exceed their neighborhood.",
+    help="percentile: the strongest cells; with --config, those of the range-azimuth map. "
+    "cfar: bins that exceed their neighborhood.",
 )
+@entry.own_reader
 @_rate
 @click.option(
     "--threshold-db",
@@ -241,15 +263,17 @@ def points(
     paths: tuple[str, ...],
     out: pathlib.Path,
     suffix: str,
+    config: str | None,
     sequence_numbers: tuple[int, ...] | None,
     weather: tuple[str, ...] | None,
     **options: Any,
 ) -> None:
     """Write radar points of radar tensors, projections, polar3d or rpc files.
 
-    PATHS are files and folders. OUT/SEQUENCE/rpc_FRAME has the columns of K-Radar's rpc
-    files. Existing files are replaced; points of other options are an error. Files that
-    are corrupted are skipped and listed, with exit code 1.
+    PATHS are files and folders, or roots that the reader of --config reads.
+    OUT/SEQUENCE/rpc_FRAME has the columns of K-Radar's rpc files. Existing files are
+    replaced; points of other options are an error. Files that are corrupted are skipped
+    and listed, with exit code 1.
 
     Example: radejax points /disk1/kradar --to pcd --method cfar --out clouds
     """
@@ -257,37 +281,47 @@ def points(
 
     from radejax.core.manifest import Manifest
     from radejax.data.kradar.folders import is_elevation_axis_up, read_grid
-    from radejax.data.kradar.points import read_points, write_points
+    from radejax.data.kradar.points import frame_points, read_points, write_points
     from radejax.data.kradar.radar_files import find_frames, sequence_folder
     from radejax.data.records import PreprocessReport
 
-    frames = find_frames(paths, sequence_numbers, weather)
-    sources = dict[pathlib.Path, pathlib.Path]()
+    sources: dict[pathlib.Path, pathlib.Path | LabelledFrame] = {}
+    read: Callable[[Any], np.ndarray]
+    if config is not None:
+        frames = entry.read_frames(
+            paths, config, sequence_numbers=sequence_numbers, weather=weather
+        )
+        names = (f"{frame.sequence}/rpc_{frame.name}.{suffix}" for frame in frames)
+        sources |= zip(map(out.joinpath, names), frames, strict=True)
+        read = functools.partial(frame_points, grid=frames.grid, **options)
+    else:
+        files = find_frames(paths, sequence_numbers, weather)
+        for path in files:
+            name = f"rpc_{path.stem.rpartition('_')[2]}.{suffix}"
+            target = out.absolute() / sequence_folder(path).name / name
+            if target == path.absolute() or target in sources:
+                raise UserError(
+                    f"{sources.get(target, path)} and {path} would both be {target}; name "
+                    "another --out, or roots of one form of radar data"
+                )
+            sources[target] = path
+        folders = {sequence_folder(path).parent for path in files}
+        roots = sorted({*map(pathlib.Path, paths), *folders})
+        is_up = is_elevation_axis_up(roots)
+        grid = read_grid(roots)
+        read = functools.partial(read_points, grid=grid, is_axis_up=is_up, **options)
     skipped = dict[str, str]()
-    for path in frames:
-        name = f"rpc_{path.stem.rpartition('_')[2]}.{suffix}"
-        target = out.absolute() / sequence_folder(path).name / name
-        if target == path.absolute() or target in sources:
-            raise UserError(
-                f"{sources.get(target, path)} and {path} would both be {target}; name "
-                "another --out, or roots of one form of radar data"
-            )
-        sources[target] = path
-    folders = {sequence_folder(path).parent for path in frames}
-    roots = sorted({*map(pathlib.Path, paths), *folders})
-    grid = read_grid(roots)
-    is_axis_up = is_elevation_axis_up(roots)
     Manifest.claim(out, "points", options, patterns=["rpc_*"])
     began = time.perf_counter()
-    for target, path in tqdm.tqdm(sources.items(), "points", unit="frame"):
+    for target, source in tqdm.tqdm(sources.items(), "points", unit="frame"):
         try:
-            cloud = read_points(path, grid, is_axis_up=is_axis_up, **options)
+            cloud = read(source)
         except (DataError, OSError) as error:
-            skipped[str(path)] = str(error)
+            skipped[getattr(source, "key", str(source))] = str(error)
             continue
         write_points(target, cloud)
     seconds = time.perf_counter() - began
-    _echo_report(PreprocessReport(len(frames), 0, skipped, seconds))
+    _echo_report(PreprocessReport(len(sources), 0, skipped, seconds))
 
 
 @click.command(cls=entry.Command)
@@ -350,7 +384,7 @@ def embed(
     report = embed_dataset(
         model,
         variables,
-        radejax.KRadar(roots, version=settings.data.label_version, **part),
+        entry.read_frames(roots, settings, **part),
         out,
         dtype=dtype,
         resize=settings.data.used_camera.resize,

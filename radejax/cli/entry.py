@@ -15,14 +15,19 @@ import pathlib
 import re
 import signal
 import sys
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
 
 import click
 
+import radejax
 from radejax.core.compilation_cache import enable_compilation_cache
 from radejax.core.errors import UserError, one_line
 from radejax.core.files import is_no_space
+
+if TYPE_CHECKING:
+    from radejax.config import Config
+    from radejax.data.dataset import LabelledFrame, LabelledFrames
 
 Function = Callable[..., object]
 Decorator = Callable[[Function], Function]
@@ -308,15 +313,63 @@ weather = several(
 part = together(labels, sequences, weather)
 
 
+own_reader = click.option(
+    "--config",
+    metavar="CONFIG",
+    help="Config as of `radejax train` that names a reader of other data than K-Radar.",
+)
 labelled_frames = together(
+    own_reader,
     click.option(
         "--label-version",
         "version",
-        default="v2.1",
-        help="Version of the labels: v1.0, v1.1, v2.0 or v2.1.",
+        help="Version of the labels: v1.0, v1.1, v2.0 or v2.1. Default: v2.1, or the config's.",
     ),
     part,
 )
+
+
+def read_frames(
+    roots: Sequence[str],
+    config: str | Config | None = None,
+    *,
+    version: str | None = None,
+    sequence_numbers: Sequence[int] | None = None,
+    weather: Sequence[str] | None = None,
+    any_visibility: bool = False,
+    **paths: str | None,
+) -> LabelledFrames[LabelledFrame]:
+    """Reads the frames of folders by the reader of a config, that of K-Radar without one.
+
+    Args:
+        roots: Folders of the dataset.
+        config: Config, or its file or name.
+        version: Version of the labels; the config's if None.
+        sequence_numbers: Sequences to read; all if None.
+        weather: Weathers to read; all if None.
+        any_visibility: Whether objects of every visibility flag are read.
+        **paths: Other paths of `config.data`, such as `labels`; the config's if None.
+    """
+    from radejax.core.structures import CLASSES
+    from radejax.data import dataset
+    from radejax.data.options import DataOptions
+
+    options = DataOptions()
+    classes: Sequence[str] = CLASSES
+    if config is not None:
+        settings = radejax.load_config(config) if isinstance(config, str) else config
+        options, classes = settings.data, settings.classes
+    options = options.replace(
+        roots=roots,
+        label_version=version or options.label_version,
+        sequences=sequence_numbers or (),
+        weather=weather or (),
+        visibility=None if any_visibility else options.visibility,
+        **{name: path for name, path in paths.items() if path is not None},
+    )
+    return dataset.read_frames(options, classes)
+
+
 camera_calibration = click.option(
     "--camera-calibration",
     type=EXISTING,

@@ -17,7 +17,7 @@ from radejax.core.errors import UserError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from radejax.data.kradar.dataset import Frame
+    from radejax.data.dataset import LabelledFrame, LabelledFrames
 
 MODEL = pathlib.Path(__file__).with_name("demo_model")
 """Model of the quickstart with seed 0; docs/detector.md lists the commands that made it."""
@@ -58,6 +58,7 @@ def overlay(
     slices: bool,
     lidar: bool,
     roi: str,
+    config: str | None,
     workdir: str | None,
     max_frames: int | None,
     **part: Any,
@@ -67,7 +68,7 @@ def overlay(
     FRAME is sequence/radar_lidar, sequence/radar, or one sequence, of which the first
     frame is drawn. All frames are drawn where --out ends in .gif.
     --sequences and --weather select frames without a FRAME. Labels of every visibility
-    are drawn, also those that training leaves out.
+    are drawn, also those that training leaves out. Without radar data, the image is drawn.
 
     Example: radejax overlay 1/00033_00001 --data ROOT
     """
@@ -87,20 +88,17 @@ def overlay(
         raise UserError("--slices shows no LiDAR points: leave out --lidar or --slices")
     if slices and workdir:
         raise UserError("--slices shows no detections: leave out --workdir or --slices")
-    frames = radejax.KRadar(roots, visibility=None, **part)
-    if not len(frames):
-        raise UserError("no frames of these sequences and weathers")
+    frames, detector = _open(roots, config, workdir, **part)
     found = [
         frame
         for frame in frames
-        if frame_name in ("", frame.name, frame.name.partition("_")[0])
+        if frame_name in ("", (key := frame_key(frame.name)), key.partition("_")[0])
     ]
     if not found:
         raise UserError(
             f"no frame {frame_name} in sequence {sequence}; there are "
             f"{frames[0].name} to {frames[-1].name}"
         )
-    detector = _detector(frames, workdir)
     is_animation = out.suffix.lower() == ".gif"
     found = found[: max_frames if is_animation else 1]
     if is_animation:
@@ -113,21 +111,27 @@ def overlay(
     click.echo(f"drew {out}{'' if slices else _undrawn(found)}")
 
 
-def _undrawn(frames: Sequence[Frame]) -> str:
-    """Says for how many frames no boxes are drawn on an image, and why."""
-    images = sum(frame.camera_path is None for frame in frames)
-    calibrations = sum(frame.camera_calibration_path is None for frame in frames)
+def _undrawn(frames: Sequence[LabelledFrame]) -> str:
+    """Says for how many frames no radar data, or no boxes on an image, are drawn, and why."""
+    radar = sum(not (x.radar_path and x.radar_path.exists()) for x in frames)
+    shown = [frame for frame in frames if frame.camera_path is not None]
+    calibrations = sum(frame.camera_calibration_path is None for frame in shown)
+    text = f"; {radar} of {len(frames)} frames have no radar data" if radar else ""
+    images = len(frames) - len(shown)
     if not images + calibrations:
-        return ""
+        return text
+    option = (
+        " (--camera-calibration FOLDER, or camera_calibration_path of an own reader)"
+    )
     return (
-        f"; not all have boxes on the image: {images} of {len(frames)} frames have no front "
-        f"image, {calibrations} no camera calibration (--camera-calibration FOLDER)"
+        f"{text}; not all have boxes on the image: {images} of {len(frames)} frames have no "
+        f"front image, {calibrations} no camera calibration{option if calibrations else ''}"
     )
 
 
 def _draw(
-    frames: radejax.KRadar,
-    frame: Frame,
+    frames: LabelledFrames[LabelledFrame],
+    frame: LabelledFrame,
     slices: bool,
     lidar: bool,
     roi: str,
@@ -139,13 +143,16 @@ def _draw(
         FileNotFoundError: The frame has neither a tensor nor a projection, or no LiDAR scan
             is there that is to be drawn.
     """
+    from radejax.data.kradar import Frame, KRadar
     from radejax.data.kradar.points import read_lidar
     from radejax.visualize.draw import draw_slices
 
     grid = frames.grid if detector is None else detector.grid
     region = None if roi == "none" else roi
-    scene = _scene(frame, grid, detector, roi=region)
+    scene = _scene(frame, grid, detector, may_lack_radar=not slices, roi=region)
     if lidar:
+        if not isinstance(frames, KRadar) or not isinstance(frame, Frame):
+            raise UserError("--lidar draws K-Radar's os2-64/*.pcd: leave it out")
         points_m = read_lidar(frames.lidar_path(frame)) + frame.radar_from_lidar_m
         scene = dataclasses.replace(scene, lidar_m=points_m)
     return draw_slices(scene) if slices else radejax.draw_frame(scene)
@@ -161,6 +168,7 @@ def _draw(
 def view(
     roots: tuple[str, ...],
     out: pathlib.Path,
+    config: str | None,
     workdir: str | None,
     max_frames: int | None,
     **part: Any,
@@ -176,14 +184,13 @@ def view(
 
     from radejax.visualize.recordings import write_recording
 
-    frames = radejax.KRadar(roots, visibility=None, **part)
+    frames, detector = _open(roots, config, workdir, **part)
     complete = [frame for frame in frames if frame.radar_path]
     if not complete:
         raise UserError(
             f"no radar tensor or projection for any of {len(frames)} labelled frames"
         )
     shown = complete[:max_frames]
-    detector = _detector(frames, workdir)
     bar = tqdm.tqdm(shown, desc="record", unit="frame")
     grid = frames.grid if detector is None else detector.grid
     write_recording(viewer_scenes(bar, grid, detector), out)
@@ -194,7 +201,7 @@ def view(
 
 
 def viewer_scenes(
-    frames: Iterable[Frame],
+    frames: Iterable[LabelledFrame],
     grid: radejax.RadarGrid,
     detector: radejax.Detector | None = None,
 ) -> Iterator[radejax.Scene]:
@@ -202,30 +209,54 @@ def viewer_scenes(
 
     All frames must have radar data. With a detector, the scenes contain its predictions.
     """
+    from radejax.data.kradar import Frame
+
     for frame in frames:
-        yield _scene(frame, grid, detector, time_s=frame.header.timestamp_s)
+        time_s = frame.header.timestamp_s if isinstance(frame, Frame) else None
+        yield _scene(frame, grid, detector, time_s=time_s)
 
 
-def _detector(frames: radejax.KRadar, workdir: str | None) -> radejax.Detector | None:
-    """Returns the detector of a run that was trained on this release, or None."""
+def _open(
+    roots: Sequence[str], config: str | None, workdir: str | None, **part: Any
+) -> tuple[LabelledFrames[LabelledFrame], radejax.Detector | None]:
+    """Returns the frames to draw, and the detector of a run on such data, or None.
+
+    The reader is that of the config, or else of the run.
+    """
+    from radejax.data.dataset import find_reader
     from radejax.data.kradar.reduced import check_release
 
     if workdir is None:
-        return None
+        return entry.read_frames(roots, config, any_visibility=True, **part), None
     detector = radejax.Detector.from_workdir(workdir)
-    release = detector.saved.config.data.release
-    check_release(frames.release, release, "radar data to draw")
-    return detector
+    settings = detector.saved.config
+    is_kradar = find_reader(settings.data.format) is radejax.KRadar
+    reader = config if config or is_kradar else settings
+    frames = entry.read_frames(roots, reader, any_visibility=True, **part)
+    check_release(frames.release, settings.data.release, "radar data to draw")
+    return frames, detector
 
 
 def _scene(
-    frame: Frame,
+    frame: LabelledFrame,
     grid: radejax.RadarGrid,
     detector: radejax.Detector | None,
+    *,
+    may_lack_radar: bool = False,
     **fields: Any,
 ) -> radejax.Scene:
-    """Reads a frame and returns its scene, with detections if there is a detector."""
-    projection = frame.read_projection(grid)
+    """Reads a frame and returns its scene, with detections if there is a detector.
+
+    Instead of missing radar data, there may be a map of NaN if there is an image.
+    """
+    import numpy as np
+
+    try:
+        projection = frame.read_projection(grid)
+    except FileNotFoundError:
+        if not may_lack_radar or frame.camera_path is None or detector is not None:
+            raise
+        projection = np.full(grid.projection_shape, np.nan, np.float32)
     if detector is not None:
         _, camera = radejax.front_view(frame) if detector.takes_camera else (None, None)
         image = None if camera is None else [frame.camera_path]

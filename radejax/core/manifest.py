@@ -135,6 +135,7 @@ class Manifest:
         options: JsonObject,
         names: Sequence[str] = (),
         patterns: Sequence[str] = (),
+        option: str = "",
     ) -> Manifest:
         """Describes a new folder, or opens that of an earlier call of the same job.
 
@@ -146,6 +147,7 @@ class Manifest:
             options: See `Manifest`.
             names: See `Manifest`.
             patterns: Patterns of the names of the job's files, such as "*.npy".
+            option: Options of commands that choose the folder, such as " (--out)".
 
         Raises:
             UserError: The folder belongs to another job; the message names the options that
@@ -159,15 +161,17 @@ class Manifest:
             "options": options,
             "names": list(names),
         }
+        fix = f"choose another folder{option}, or delete that one"
         written = files.find_files(folder, *patterns) if folder.is_dir() else []
         if written and not (folder / FILE).exists():
             raise UserError(
                 f"{files.relative(written[0])} is there, but no {FILE} that describes how "
-                "it was made: choose another folder, or delete that one"
+                f"it was made: {fix}"
             )
         try:
             ignore = ("radejax",)
-            files.claim(folder / FILE, wanted, f"other {what}", ignore=ignore)
+            other = f"other {what}"
+            files.claim(folder / FILE, wanted, other, fix=fix, ignore=ignore)
         except UserError:
             same = files.read_object(folder / FILE).get("what") == what
             if written or not patterns or not same:

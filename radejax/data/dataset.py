@@ -10,6 +10,7 @@ from __future__ import annotations
 import collections
 import copy
 import dataclasses
+import itertools
 import pathlib
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Self, TypeVar, overload
@@ -17,14 +18,16 @@ from typing import Any, Self, TypeVar, overload
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
-from radejax.core.errors import UserError, require
+from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import JsonObject
 from radejax.core.options import find_part
 from radejax.data.options import DataOptions
+from radejax.data.projection import PROBLEMS, find_problems
 from radejax.geometry.camera import CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
 
 _MAX_YAW_RAD = 10.0  # larger angles are taken to be degrees
+_BEV_Z_M, _BEV_HEIGHT_M = 0.0, 1.5  # of boxes whose labels have neither
 
 
 @dataclasses.dataclass
@@ -89,7 +92,8 @@ class LabelledFrame:
     Attributes:
         sequence: Number of the sequence.
         name: Name that is unique in the sequence.
-        boxes: x, y, z, l, w, h, yaw in the radar frame, in meters and radians.
+        boxes: x, y, z, l, w, h, yaw in the radar frame, in meters and radians. Boxes of
+            x, y, l, w, yaw get the height of the radar as z, and a height of 1.5 m.
         classes: Class names of `boxes`.
         columns: Further values of the objects by name, one row per box. K-Radar's reader
             has "track_id", "velocity_mps", "speed_mps" and "visibility".
@@ -122,6 +126,12 @@ class LabelledFrame:
     radar_from_lidar_z_m: float = 0.0
     is_simulated: bool = False
 
+    def __post_init__(self) -> None:
+        boxes = np.asarray(self.boxes)
+        if boxes.ndim == 2 and boxes.shape[1] == 5:
+            boxes = np.insert(boxes, (2, 4), (_BEV_Z_M, _BEV_HEIGHT_M), axis=1)
+            object.__setattr__(self, "boxes", boxes)
+
     @property
     def key(self) -> str:
         """Name that is unique in a dataset, such as `"1/00033_00001"`."""
@@ -151,6 +161,23 @@ class LabelledFrame:
             DataError: The file is corrupted, or its shape does not match the grid.
         """
         raise NotImplementedError
+
+    def read_checked(self, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
+        """Reads the projection and checks shape and values.
+
+        Raises:
+            FileNotFoundError: The frame has no radar file.
+            DataError: The projection has another shape than the grid, or values that do not
+                come from linear power.
+        """
+        projection = self.read_projection(grid)
+        shape = grid.projection_shape
+        if projection.shape != shape:
+            raise DataError(f"projection of shape {projection.shape}, not {shape}")
+        found = find_problems(projection.max(axis=0)[None], projection.min()[None])
+        for problem in itertools.compress(PROBLEMS, found):
+            raise DataError(f"projection: {problem}")
+        return projection
 
     def read_calibration(
         self, radar_from_lidar_m: tuple[float, ...] | None = None
@@ -328,8 +355,13 @@ class LabelledFrames(Sequence[_F]):
             classes: Classes to detect.
 
         Raises:
-            UserError: Yaws are in degrees, or a column has not one row per box.
+            UserError: Frames have the same key, yaws are in degrees, or a column has not one
+                row per box.
         """
+        keys = collections.Counter(frame.key for frame in self)
+        for key, number in keys.most_common(1):
+            expected = "1: other names or sequences"
+            require(number == 1, f"number of frames {key}", number, expected)
         counts = collections.Counter[str]()
         frames: list[LabelledFrame] = []
         for frame in self:
@@ -359,7 +391,35 @@ class LabelledFrames(Sequence[_F]):
                 frame = dataclasses.replace(frame, boxes=boxes, classes=names)
                 frame = frame.with_objects(kept)
             frames.append(frame)
+        lacking = "frames with a camera_path and no camera_calibration_path"
+        for frame in self:
+            is_lacking = frame.camera_path and not frame.camera_calibration_path
+            counts[f"{lacking}: read_calibration is not called"] += bool(is_lacking)
         return self._with(frames, self._summary.plus(Summary(counts)))
+
+
+def read_frames(
+    options: DataOptions, classes: Sequence[str]
+) -> LabelledFrames[LabelledFrame]:
+    """Reads the frames of the chosen sequences and weathers by the reader of a config.
+
+    Args:
+        options: The section `config.data`, of which `format` names the reader.
+        classes: Classes of the objects to keep.
+
+    Raises:
+        UserError: There is no such reader, there are no frames, or boxes or columns are
+            wrong, see `LabelledFrames.with_valid_boxes`.
+    """
+    frames = find_reader(options.format).from_options(options, classes)
+    frames = frames.with_valid_boxes(classes).part(options.sequences, options.weather)
+    if not len(frames):
+        chosen = options.sequences or options.weather
+        part = " of these sequences and weathers" if chosen else ""
+        raise UserError(
+            f"no frames{part} in {', '.join(options.roots)}: give the roots of the dataset"
+        )
+    return frames
 
 
 def find_reader(name: str) -> type[LabelledFrames[LabelledFrame]]:

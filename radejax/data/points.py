@@ -1,13 +1,14 @@
-"""Radar points of projections by CFAR."""
+"""Radar points of projections: the strongest bins, or those that CFAR finds."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import uniform_filter  # type: ignore[attr-defined]
 
+from radejax.core.errors import require
 from radejax.data.projection import LOG_OFFSET_DB, LOG_SCALE_DB
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -48,7 +49,8 @@ def cfar_points(
     two halves of the projection.
 
     Args:
-        projection: Normalized projection, as `project_tensor` returns it.
+        projection: Normalized projection; of a tensor, it is
+            `grid.measured_channels(project_tensor(tensor))`.
         grid: Sensor axes of the projection.
         threshold_db: Minimum power of a point above the mean of its training cells.
         guard_cells: Number of guard cells on each side of a bin.
@@ -57,14 +59,81 @@ def cfar_points(
     Returns:
         The points, by descending power.
 
+    Raises:
+        UserError: The projection does not match the grid.
+
     References:
         Cell averaging: Richards, Fundamentals of Radar Signal Processing, ch. 6.
+
+    Examples:
+        >>> from radejax.data.projection import project_tensor
+        >>> grid = RadarGrid.reduced(
+        ...     num_doppler=4, num_range=40, num_elevation=2, num_azimuth=30
+        ... )
+        >>> power = np.ones(grid.shape_drea, np.float32)
+        >>> power[2, 20, 1, 15] = 1000.0
+        >>> points = cfar_points(project_tensor(power), grid, threshold_db=12.0)
+        >>> points.range_bin.tolist(), points.power_db.round().tolist()
+        ([20], [30.0])
     """
-    doppler, elevation = np.split(projection, [grid.num_doppler], axis=-1)
-    strongest = (doppler if grid.num_doppler else elevation).max(-1)
-    power_db = strongest * LOG_SCALE_DB - LOG_OFFSET_DB
+    power_db = _power_db(projection, grid)
     mean_db = local_mean_db(power_db, guard_cells, training_cells)
-    r, a = np.nonzero(power_db - mean_db > threshold_db)
+    return _points_where(power_db - mean_db > threshold_db, power_db, projection, grid)
+
+
+def percentile_points(
+    projection: Float[np.ndarray, "R A DE"], grid: RadarGrid, rate: float = 0.01
+) -> Points:
+    """Returns the strongest bins of the range-azimuth map of a projection as points.
+
+    Args:
+        projection: Normalized projection, see `cfar_points`.
+        grid: Sensor axes of the projection.
+        rate: Fraction of the range-azimuth bins that become points, above 0 and below 1.
+
+    Returns:
+        The points, by descending power.
+
+    Raises:
+        UserError: The projection does not match the grid, or the rate is out of its range.
+
+    Examples:
+        >>> grid = RadarGrid.reduced(
+        ...     num_doppler=4, num_range=10, num_elevation=2, num_azimuth=10
+        ... )
+        >>> projection = np.random.default_rng(0).random((10, 10, 6), np.float32)
+        >>> percentile_points(projection, grid, rate=0.05).x_m.shape
+        (5,)
+    """
+    require(0 < rate < 1, "rate", rate, "a number above 0 and below 1")
+    power_db = _power_db(projection, grid)
+    is_strong = power_db > np.quantile(power_db, 1 - rate)
+    return _points_where(is_strong, power_db, projection, grid)
+
+
+def _power_db(
+    projection: Float[np.ndarray, "R A DE"], grid: RadarGrid
+) -> Float[np.ndarray, "R A"]:
+    """Returns the power of the strongest Doppler (or elevation) bin in dB."""
+    is_same = projection.shape == grid.projection_shape
+    expected = (
+        f"{grid.projection_shape}: range, azimuth, Doppler + elevation of the grid"
+    )
+    require(is_same, "shape of the projection", projection.shape, expected)
+    channels = slice(grid.num_doppler or None)
+    power_db: np.ndarray = projection[..., channels].max(-1) * LOG_SCALE_DB
+    return power_db - LOG_OFFSET_DB
+
+
+def _points_where(
+    is_point: Bool[np.ndarray, "R A"],
+    power_db: Float[np.ndarray, "R A"],
+    projection: Float[np.ndarray, "R A DE"],
+    grid: RadarGrid,
+) -> Points:
+    """Returns the chosen bins by descending power."""
+    doppler, elevation = np.split(projection, [grid.num_doppler], axis=-1)
+    r, a = np.nonzero(is_point)
     order = np.argsort(-power_db[r, a], kind="stable")
     r, a = r[order], a[order]
     azimuth_rad = grid.azimuth_rad[a]

@@ -110,7 +110,9 @@ class Records:
             dtype = cls.open(folder).dtype if path.is_file() else default_dtype
         require(dtype in ENCODINGS, "dtype", dtype, f"one of {', '.join(ENCODINGS)}")
         options = {"shape": list(shape), "dtype": dtype, "source": source}
-        manifest.Manifest.claim(folder, "records", options, patterns=["*.npy"])
+        manifest.Manifest.claim(
+            folder, "records", options, (), ["*.npy"], " (--records, or --out)"
+        )
         return cls.open(folder)
 
     @functools.cached_property
@@ -203,7 +205,7 @@ def open_projections(folder: files.PathLike, grid: RadarGrid | None = None) -> R
     if grid is not None and grid != records.grid:
         raise UserError(
             f"{folder}: records of a grid of {describe_grid(records.grid)}, expected "
-            f"{describe_grid(grid)}"
+            f"{describe_grid(grid)}: choose another folder (--records), or delete that one"
         )
     return records
 
@@ -399,10 +401,8 @@ def _write(records: Records, frame: LabelledFrame) -> tuple[str, str]:
     """Writes the record of one frame; returns its key and the reason if it was skipped."""
     state = manifest.state_of([frame.radar_path])
     try:
-        projection = frame.read_projection(records.grid)
+        projection = frame.read_checked(records.grid)
     except (DataError, OSError) as error:
         return frame.key, str(error)
-    if projection.shape != records.shape:
-        return frame.key, f"projection of shape {projection.shape}, not {records.shape}"
     records.write(frame.key, encode(projection, records.dtype), state)
     return frame.key, ""

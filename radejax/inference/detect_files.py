@@ -25,7 +25,7 @@ from radejax.core.files import PathLike
 from radejax.core.manifest import Manifest, State, add, state_of
 from radejax.core.structures import Array, Boxes, Detections
 from radejax.data.cameras import camera_inputs, require_images
-from radejax.data.dataset import FrameSequence, find_reader
+from radejax.data.dataset import FrameSequence, find_reader, read_frames
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.folders import sequence_number
 from radejax.data.kradar.radar_files import find_frames, key_of, sequence_folder
@@ -199,8 +199,9 @@ def find_inputs(
     config = detector.saved.config
     labels = labels or config.data.labels
     camera_calibration = camera_calibration or config.data.camera_calibration
-    reader = find_reader(config.data.format)
-    if reader is KRadar:  # a derived reader may read frames in another way
+    if (
+        find_reader(config.data.format) is KRadar
+    ):  # a derived reader may read frames in another way
         found = find_frames(paths, sequence_numbers, weather)
         return _of_files(found, paths, detector, labels, camera_calibration)
     options = config.data.replace(
@@ -210,11 +211,7 @@ def find_inputs(
         sequences=tuple(sequence_numbers or ()),
         weather=tuple(weather or ()),
     )
-    frames = reader.from_options(options, config.classes)
-    frames = frames.part(options.sequences, options.weather)
-    if not len(frames):
-        named = ", ".join(map(str, paths))
-        raise UserError(f"no frames in {named}: give the roots of the dataset")
+    frames = read_frames(options, config.classes)
     if detector.grid != frames.grid:
         raise UserError(f"{paths[0]}: the radar has other axes than that of the run")
 

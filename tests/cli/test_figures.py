@@ -113,6 +113,23 @@ def test_boxes_that_cannot_be_drawn_on_the_image_are_reported(
     assert "1 of 1 frames have no front image, 0 no camera calib" in text
 
 
+def test_an_image_without_radar_data_is_drawn(
+    root: pathlib.Path, tmp_path: pathlib.Path, drawn: list[Figure]
+) -> None:
+    disk = pathlib.Path(shutil.copytree(root, tmp_path / "disk"))
+    (tensor,) = disk.glob("1/radar_tesseract/*")
+    tensor.unlink()
+    text = _run("1", disk, "--out", tmp_path / "a.png").output
+    assert text == f"drew {tmp_path / 'a.png'}; 1 of 1 frames have no radar data\n"
+    (figure,) = drawn
+    (image,) = (ax for ax in figure.axes if ax.images)
+    assert image.collections  # boxes
+    assert "no radar tensor" in _run("1", disk, "--slices", code=2).output
+    (path,) = disk.glob("1/cam-front/*")
+    path.unlink()
+    assert "no radar tensor" in _run("1", disk, code=2).output
+
+
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [

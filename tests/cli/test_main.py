@@ -218,7 +218,7 @@ def test_simulate_works_anywhere(
 def test_roots_are_separate_repeated_or_with_commas(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from radejax.data.kradar import check
+    from radejax.data import check
 
     names = ("a", "b", "c", "d,e")
     for name in names:
@@ -229,7 +229,7 @@ def test_roots_are_separate_repeated_or_with_commas(
         raise UserError(f"opened {' '.join(map(str, roots))}")
 
     monkeypatch.setattr(check, "check_dataset", look)
-    monkeypatch.setattr("radejax.data.kradar.KRadar", look)
+    monkeypatch.setattr("radejax.cli.entry.read_frames", look)
     assert "opened a b c d,e" in _run("data", "check", *names).output
     assert "'x' does not exist" in _run("data", "check", "a", "x").output
     assert "opened a b c" in _run("overlay", "1", "--data", "a,b", "--data", "c").output
@@ -238,7 +238,7 @@ def test_roots_are_separate_repeated_or_with_commas(
 def test_a_part_of_the_data_is_chosen(
     monkeypatch: pytest.MonkeyPatch, tmp_path: pathlib.Path
 ) -> None:
-    from radejax.data.kradar import check
+    from radejax.data import check
 
     seen = []
 
@@ -247,7 +247,7 @@ def test_a_part_of_the_data_is_chosen(
         raise UserError("opened")
 
     monkeypatch.setattr(check, "check_dataset", look)
-    monkeypatch.setattr("radejax.data.kradar.KRadar", look)
+    monkeypatch.setattr("radejax.cli.entry.read_frames", look)
     part = ("--sequences", "1,58", "--weather", "fog", "--weather", "rain")
     for command in (["data", "check"], ["preprocess", "--out", tmp_path], ["view"]):
         assert "opened" in _run(*command, tmp_path, *part).output

@@ -17,7 +17,7 @@ from radejax.data.kradar.reduced import (
     strongest_points,
 )
 from radejax.data.kradar.write import write_tesseract
-from radejax.data.points import cfar_points, local_mean_db
+from radejax.data.points import cfar_points, local_mean_db, percentile_points
 from radejax.data.projection import project_tensor
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -71,6 +71,24 @@ def test_what_is_not_measured_is_zero_or_nan(absent):
     ground = np.array([points.x_m[0], points.y_m[0]])
     ground *= grid.range_m[30] / np.linalg.norm(ground)
     np.testing.assert_allclose(ground, grid.bin_to_ego(30, 5))
+
+
+def test_the_strongest_bins_are_chosen_by_the_rate():
+    power = np.full(GRID.shape_drea, 1e9, np.float32)
+    power[6, 30, 4, 40] = 1e13
+    power[1, 50, 0, 10] = 1e12
+    projection = project_tensor(power)
+    points = percentile_points(projection, GRID, 1.5 / power[0, :, 0].size)
+    assert points.range_bin.tolist() == [30, 50]
+    for column, expected in zip(points, cfar_points(projection, GRID), strict=True):
+        np.testing.assert_array_equal(column, expected)
+    with pytest.raises(UserError, match=r"rate is 1\.0, expected"):
+        percentile_points(projection, GRID, 1.0)
+    for method in (cfar_points, percentile_points):
+        with pytest.raises(
+            UserError, match=r"shape of the projection is .8, 64, 5, 56"
+        ):
+            method(power, GRID)
 
 
 PCD = """# .PCD v0.7 - Point Cloud Data file format

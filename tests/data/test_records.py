@@ -362,6 +362,13 @@ def test_uneven_axes_are_kept_and_told_apart(tmp_path):
         azimuth_rad=np.linspace(first, last, 14), range_m=np.linspace(2.0, 30.0, 16)
     )
     with pytest.raises(
-        UserError, match=r"of 4 x 16 x 0 x 14 bins.*, not uniform, expected .* deg$"
+        UserError,
+        match=r"of 4 x 16 x 0 x 14 bins.*, not uniform, expected .* deg: .*--records",
     ):
         open_projections(tmp_path, even)
+    np.save(tmp_path / "1.npy", np.zeros(1))
+    source = {"grid": even.to_dict()}
+    with pytest.raises(
+        UserError, match=r"choose another folder .--records, or --out.,"
+    ):
+        Records.create(tmp_path, even.projection_shape, "float16", source)

@@ -10,8 +10,9 @@ from jaxtyping import Float
 from radejax.core.archives import wrap_read_errors
 from radejax.core.errors import DataError, require
 from radejax.core.files import PathLike, as_path, atomic_write
+from radejax.data.dataset import LabelledFrame
 from radejax.data.kradar import reduced, tesseract
-from radejax.data.points import cfar_points
+from radejax.data.points import Points, cfar_points, percentile_points
 from radejax.geometry.radar_grid import RadarGrid
 
 _MAX_HEADER_LINES = 20
@@ -57,11 +58,44 @@ def read_points(
     found = cfar_points(
         tesseract.read_frame(path, grid), grid, threshold_db=threshold_db
     )
+    return to_columns(found, grid, is_axis_up=is_axis_up)
+
+
+def to_columns(
+    found: Points, grid: RadarGrid, *, is_axis_up: bool = True
+) -> Float[np.ndarray, "N 11"]:
+    """Returns points of `radejax.data.points` with the columns `POINT_FIELDS`.
+
+    Args:
+        found: The points.
+        grid: Axes of the radar.
+        is_axis_up: Whether the elevation axis points up, see `is_elevation_axis_up`.
+    """
     power = 10 ** (found.power_db / 10) / reduced.POWER_UNIT
     bins = found.range_bin, found.azimuth_bin, found.elevation_bin
     return reduced.points_of_bins(
         bins, power, found.doppler_mps, grid, is_axis_up=is_axis_up
     )
+
+
+def frame_points(
+    frame: LabelledFrame,
+    grid: RadarGrid,
+    method: str = "percentile",
+    *,
+    rate: float = 0.01,
+    threshold_db: float = 9.0,
+) -> Float[np.ndarray, "N 11"]:
+    """Returns the points of a frame of any reader as `read_points` does.
+
+    "percentile" chooses the strongest bins of the range-azimuth map.
+    """
+    projection = frame.read_projection(grid)
+    if method == "cfar":
+        found = cfar_points(projection, grid, threshold_db=threshold_db)
+    else:
+        found = percentile_points(projection, grid, rate)
+    return to_columns(found, grid)
 
 
 def write_points(path: PathLike, points: Float[np.ndarray, "N 11"]) -> None:

@@ -1,4 +1,4 @@
-"""Health report on a K-Radar copy: existing, missing and corrupted files."""
+"""Health report on a dataset: what there is, and what is missing, corrupted or implausible."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from tqdm import tqdm
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import JsonObject, PathLike
 from radejax.core.structures import CLASSES, RARE_SHARE
-from radejax.data.dataset import Summary
+from radejax.data.cameras import front_view
+from radejax.data.dataset import FrameSequence, LabelledFrame, LabelledFrames, Summary
 from radejax.data.kradar.conditions import KRADAR_CONDITIONS, UNKNOWN_CONDITIONS
 from radejax.data.kradar.dataset import Frame, KRadar
 from radejax.data.kradar.folders import SequenceFolder, read_calibration
@@ -36,15 +37,15 @@ Rows = list[JsonObject]
 
 @dataclasses.dataclass(frozen=True)
 class HealthReport:
-    """Result of `check_dataset`.
+    """Result of `check_dataset` and `check_frames`.
 
     Attributes:
         roots: The folders that were checked.
-        version: Version of the labels.
+        version: Version of the labels, or name of the reader.
         sequences: One row per sequence with its conditions, its numbers of files, and
             the numbers of labelled frames without these files.
         objects: One row per split and weather with the number of objects of every class
-            that are visible to the radar and in its field of view.
+            that training uses: visible to the radar and in its field of view.
         summary: Counts, problems with file and line, and notes.
     """
 
@@ -74,8 +75,8 @@ class HealthReport:
             f"{len(self.sequences)} sequences in {', '.join(self.roots)}; labels "
             f"{self.version}",
             tabulate(self.sequences, headers=names),
-            "Objects that are visible to the radar and in its field of view, and their "
-            f"share of the row; *: under {RARE_SHARE:.0%} of the training objects of a "
+            "Objects that training uses (visible to the radar and in its field of view), and "
+            f"their share of the row; *: under {RARE_SHARE:.0%} of the training objects of a "
             "weather.",
             tabulate(objects, "keys", disable_numparse=True, stralign="right"),
             self.summary.to_text(),
@@ -86,12 +87,12 @@ class HealthReport:
 
 def _with_shares(row: JsonObject) -> dict[str, str]:
     """Formats one row of `objects` as text with the share of every class."""
-    total = max(sum(row[cls] for cls in CLASSES), 1)
+    counts = {name: x for name, x in row.items() if name not in ("split", "weather")}
     cells = {}
-    for cls in CLASSES:
-        share = row[cls] / total
+    for cls, count in counts.items():
+        share = count / max(sum(counts.values()), 1)
         mark = "*" if row["split"] == "train" and share < RARE_SHARE else ""
-        cells[cls] = f"{mark}{row[cls]:,} ({100 * share:4.1f} %)"
+        cells[cls] = f"{mark}{count:,} ({100 * share:4.1f} %)"
     return {**row, **cells}
 
 
@@ -158,8 +159,53 @@ def check_dataset(
         rows.append(row | {"radar_corrupted": corrupted[number]})
     _check_parts(rows, summary)
     names = [str(path) for path in data.files.roots]
-    objects = _count_objects(data, splits)
+    objects = _count_objects(data, splits, CLASSES)
     return HealthReport(names, data.files.options.version, rows, objects, summary)
+
+
+def check_frames(
+    frames: LabelledFrames[LabelledFrame],
+    classes: Sequence[str],
+    roots: Sequence[str],
+    *,
+    deep: bool = False,
+    progress: bool = False,
+) -> HealthReport:
+    """Checks the frames of any reader and reports their content and their problems.
+
+    Args:
+        frames: Frames, such as those of `read_frames`.
+        classes: Classes of their objects.
+        roots: Folders of the dataset, for the report.
+        deep: Whether to read radar data, image and calibration of every frame, instead of
+            the first one of each sequence.
+        progress: Whether to show a progress bar.
+    """
+    summary = frames.summary()
+    splits = _find_splits(frames)
+    sequences: dict[int, list[LabelledFrame]] = {}
+    for frame in frames:
+        sequences.setdefault(frame.sequence, []).append(frame)
+    read = [x for own in sequences.values() for x in own[: None if deep else 1]]
+    for frame in tqdm(read, "check", unit="frame", disable=not progress):
+        try:
+            frame.read_checked(frames.grid)
+            front_view(frame)
+        except (DataError, OSError) as error:
+            summary.report("frame", f"{frame.key}: {error}")
+    summary.counts["frames that were read"] = len(read)
+    rows = []
+    for number, own in sequences.items():
+        in_split = collections.Counter(splits.get(frame.key) for frame in own)
+        lacking = {
+            f"without_{kind}": sum(getattr(x, f"{kind}_path") is None for x in own)
+            for kind in ("radar", "camera", "camera_calibration")
+        }
+        row = {"sequence": number, "weather": own[0].weather, "frames": len(own)}
+        rows.append(row | {x: in_split[x] for x in ("train", "test")} | lacking)
+    reader = f"read by {type(frames).__module__}:{type(frames).__qualname__}"
+    objects = _count_objects(frames, splits, classes)
+    return HealthReport(list(roots), reader, rows, objects, summary)
 
 
 def _check_parts(rows: Rows, summary: Summary) -> None:
@@ -210,7 +256,7 @@ def _row(
     }
 
 
-def _find_splits(data: KRadar) -> dict[str, str]:
+def _find_splits(data: LabelledFrames[LabelledFrame]) -> dict[str, str]:
     """Returns the split of every frame and adds problems of the splits to the summary."""
     splits: dict[str, str] = {}
     summary = data.summary()
@@ -228,7 +274,9 @@ def _find_splits(data: KRadar) -> dict[str, str]:
     return splits
 
 
-def _count_objects(frames: Iterable[Frame], splits: Mapping[str, str]) -> Rows:
+def _count_objects(
+    frames: FrameSequence, splits: Mapping[str, str], classes: Sequence[str]
+) -> Rows:
     counts: dict[tuple[str, str], collections.Counter[str]] = {}
     for frame in frames:
         for weather in (frame.weather, "all"):
@@ -236,7 +284,7 @@ def _count_objects(frames: Iterable[Frame], splits: Mapping[str, str]) -> Rows:
             counts.setdefault(row, collections.Counter()).update(frame.classes.tolist())
     return [
         {"split": split, "weather": weather}
-        | {cls: counts[split, weather][cls] for cls in CLASSES}
+        | {cls: counts[split, weather][cls] for cls in classes}
         for split, weather in sorted(counts)
     ]
 
