@@ -248,6 +248,8 @@ def _by_chunk(
     machine's. The forward and the backward pass call this separately, because the choice of
     the platform is not differentiated.
     """
+    if len(chunk_sizes) == 1:  # jax2onnx converts no choice, not even of one
+        return function(chunk_sizes[0][1], *arrays)
     by_platform = {
         platform: functools.partial(function, size) for platform, size in chunk_sizes
     }
