@@ -84,6 +84,25 @@ def test_the_committed_page_is_what_the_committed_files_give(
     assert page.read_text() == committed, "python benchmarks/run.py --tables"
 
 
+def test_the_latency_table_is_that_of_the_stored_result(
+    modules: types.SimpleNamespace,
+) -> None:
+    import latency
+
+    result = json.loads(latency.RESULT.read_text())
+    page = latency.PAGE.read_text()
+    assert latency.table(result) in page, "python benchmarks/latency.py"
+    names = [variant.name for variant in latency.VARIANTS]
+    assert [row["name"] for row in result["rows"]] == names
+    means = [line for line in result["int8"] if line.startswith("| mean")]
+    assert len(means) == 4
+    for line in means:
+        _, name, exact, quantized, _ = map(str.strip, line.split("|"))
+        _, space, iou = name.split(", ")
+        known = f"| mean AP {space.upper()}, {iou} | {exact} | {quantized} |"
+        assert known in page
+
+
 @pytest.mark.slow  # compiles each stage on its own
 def test_stages_add_up(modules: types.SimpleNamespace) -> None:
     (row,) = modules.stages.measure(small.detector("camera"), (2,), repeats=1)

@@ -10,6 +10,7 @@ import click
 
 import radejax
 from radejax.cli import entry
+from radejax.core.errors import UserError
 
 if TYPE_CHECKING:
     from radejax.inference.saved import Step
@@ -142,10 +143,23 @@ def detect(
     help="Radar data with which the program begins.",
 )
 @click.option(
+    "--dtype",
+    type=click.Choice(["float32", "bfloat16"]),
+    help="Dtype of the computation; bfloat16 is for accelerators (stablehlo only). "
+    "Default: the config's.",
+)
+@click.option(
+    "--int8",
+    is_flag=True,
+    help="Compute convolutions in int8 (onnx only). Frames of the train split calibrate "
+    "it, and those of the test split give the APs in the README of the folder.",
+)
+@entry.several("--data", "roots", help="Roots for --int8. Default: those of the run.")
+@click.option(
     "--half", is_flag=True, help="Store weights as float16 (huggingface only)."
 )
 def export(
-    source: str, out: pathlib.Path, image_backbone: str | None, **settings: Any
+    source: str, out: pathlib.Path, int8: bool, roots: tuple[str, ...], **settings: Any
 ) -> None:
     """Export a model as a folder for other programs.
 
@@ -159,8 +173,16 @@ def export(
     from radejax.inference import export as exporting
 
     entry.set_up_jax()
-    detector = radejax.Detector.from_workdir(source, image_backbone=image_backbone)
-    num_bytes, left_out = exporting.export(detector, out, **settings)
+    options = {name: settings.pop(name) for name in ("image_backbone", "dtype")}
+    detector = radejax.Detector.from_workdir(source, **options)
+    if roots and not int8:
+        raise UserError("--data is only used with --int8")
+    if int8:
+        from radejax.runs.quantize import export_int8
+
+        num_bytes, left_out = export_int8(detector, out, roots, **settings)
+    else:
+        num_bytes, left_out = exporting.export(detector, out, **settings)
     text = f"{num_bytes / 2**20:.1f} MiB written to {out}"
     if left_out:
         text += f", without {', '.join(left_out)}"

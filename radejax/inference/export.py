@@ -13,6 +13,7 @@ import json
 import logging
 import pathlib
 import re
+import tempfile
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
@@ -70,6 +71,11 @@ _SMALLEST_JAX = "0.9.2"
 _TESTED_JAX = 0, 10, 2
 """Smallest version of JAX that reads what versions up to the second one export."""
 
+_OPSET = 18
+_IR_VERSION = 8
+_SMALLEST_RUNTIME = "1.19"
+"""Versions of ONNX, and the smallest one of ONNX Runtime; older ones lack `Trilu` of bool."""
+
 CHUNK_SIZE = 1024
 """Default chunk size of the deformable attention in ONNX files, in bins."""
 
@@ -125,13 +131,16 @@ def export(
     Raises:
         UserError: The kind or a platform is unknown, jax2onnx is not installed for ONNX,
             the image transformer is to be kept for ONNX, `half` is given for a program,
-            which takes float32 weights, or the folder has other files than an export.
+            which takes float32 weights, the model computes in bfloat16 for ONNX, or the
+            folder has other files than an export.
     """
     require(kind in FORMATS, "format", kind, f"one of {FORMATS}")
     is_known = set(platforms) <= set(KNOWN_PLATFORMS)
     require(is_known, "platforms", platforms, f"some of {KNOWN_PLATFORMS}")
     if half and kind != "huggingface":
         raise UserError("--half is only supported with --format huggingface")
+    if detector.saved.config.model.dtype == "bfloat16" and kind == "onnx":
+        raise UserError("--dtype bfloat16 is not supported with --format onnx")
     shape = _radar_shape(detector, radar_input)
     folder = files.as_path(folder)
     there = {path.name for path in folder.glob("[!.]*")}
@@ -211,7 +220,7 @@ def _readme(
         detector: The detector.
         shape: Shape of one frame of the input.
         kind: Format of the folder. Parts of the text are for some formats, "all", or models
-            of several "frames".
+            of several "frames" or in "bfloat16".
         content: Content of `config.json`.
         names: Names of the files.
     """
@@ -223,7 +232,8 @@ def _readme(
     is_simulated = simulation is not None and simulation.scenes == "procedural"
     every, *parts = re.split(r"<!-- (.*) -->\n", _MODEL_CARD.read_text())
     pairs = zip(parts[::2], parts[1::2], strict=True)
-    tags = {kind, "all", "frames" if detector.num_frames > 1 else ""}
+    frames = "frames" if detector.num_frames > 1 else ""
+    tags = {kind, "all", frames, config.model.dtype}
     own = [text for names, text in pairs if tags & set(names.split())]
     use = "`load.py`, or " if "load.py" in names else ""
     listed = {n: x for n, x in (_OF_MODELS | _OF_PROGRAMS).items() if n in names}
@@ -234,6 +244,8 @@ def _readme(
         input=f"{radar} [B, {', '.join(map(str, shape))}] float32, B frames.",
         frames=detector.num_frames,
         jax=content.get("jax"),
+        opset=_OPSET,
+        runtime=_SMALLEST_RUNTIME,
         count=config.decode.max_detections,
         left_out=_LEFT_OUT if content["left_out"] else "nothing",
         origin=_SIMULATED if is_simulated else _MEASURED,
@@ -418,11 +430,31 @@ def _onnx_metadata(detector: Detector) -> dict[str, object]:
     return {
         "radejax": __version__,
         "commit": radejax_commit(),
+        "onnxruntime": f">={_SMALLEST_RUNTIME}",
         "identity": detector.saved.identity,
         "classes": detector.classes,
         "grid": detector.grid.to_dict(),
         "decode": detector.decode_options.model_dump(mode="json"),
     }
+
+
+def _simplified(model: Any) -> Any:
+    """Return an ONNX model with folded constants, so that runtimes can quantize kernels."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3  # it warns of what it removes
+    level = onnxruntime.GraphOptimizationLevel
+    options.graph_optimization_level = level.ORT_ENABLE_BASIC
+    with tempfile.TemporaryDirectory() as folder:
+        path = pathlib.Path(folder, "model.onnx")
+        options.optimized_model_filepath = str(path)
+        providers = ["CPUExecutionProvider"]
+        onnxruntime.InferenceSession(model.SerializeToString(), options, providers)
+        simplified = type(model).FromString(path.read_bytes())
+    del simplified.opset_import[:]  # the runtime lists all that it knows
+    simplified.opset_import.extend(model.opset_import)
+    return simplified
 
 
 def _onnx_files(
@@ -443,10 +475,11 @@ def _onnx_files(
             "feed precomputed embeddings (docs/deploy.md)"
         )
     try:
+        import onnxruntime  # noqa: F401, of `_simplified`
         from jax2onnx import to_onnx
     except ModuleNotFoundError as error:
         raise UserError(
-            "format onnx needs jax2onnx: pip install -e '.[onnx]'"
+            "format onnx needs jax2onnx and onnxruntime: pip install -e '.[onnx]'"
         ) from error
 
     # With a fixed chunk size, the program does not choose by platform, which jax2onnx
@@ -477,7 +510,11 @@ def _onnx_files(
         results: Sequence[str],
     ) -> bytes:
         names = {"input_names": list(given), "output_names": list(results)}
-        converted = to_onnx(function, list(given.values()), **names)
+        converted = to_onnx(function, list(given.values()), opset=_OPSET, **names)
+        converted.ir_version = _IR_VERSION
+        converted = _simplified(converted)
+        mark = {"key": "onnx.quant.pre_process", "value": "onnxruntime.quant"}
+        converted.metadata_props.add(**mark)  # the quantization would ask for it
         for name, value in _onnx_metadata(detector).items():
             converted.metadata_props.add(key=name, value=json.dumps(value))
         return bytes(converted.SerializeToString())

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import os
 import pathlib
+import re
 import shutil
 import subprocess
 import sys
@@ -399,10 +400,19 @@ def test_wrong_options_are_named_before_anything_is_written(tmp_path, monkeypatc
     for detector, options, message in (
         (radar, {"kind": "tflite"}, "format is 'tflite'"),
         (radar, {"platforms": ("cpu", "metal")}, "platforms is .* expected some of"),
+        (
+            small.detector(dtype="bfloat16"),
+            {"kind": "onnx"},
+            "bfloat16 is not supported",
+        ),
         (radar, {"half": True}, "--half is only supported with --format huggingface"),
         (radar, {"radar_input": "power"}, "input is 'power', expected one of"),
         (two, {"radar_input": "tensor"}, "input is 'tensor', expected projection, as"),
-        (radar, {"kind": "onnx"}, r"needs jax2onnx: pip install -e '.\[onnx\]'"),
+        (
+            radar,
+            {"kind": "onnx"},
+            r"needs jax2onnx and onnx.*: pip install -e '.\[onnx\]'",
+        ),
         (small.detector("camera"), onnx, "image backbone cannot be exported"),
     ):
         with pytest.raises(UserError, match=message):
@@ -415,6 +425,7 @@ def test_wrong_options_are_named_before_anything_is_written(tmp_path, monkeypatc
 def test_onnx_files_give_the_same_boxes(kind, tmp_path):
     pytest.importorskip("jax2onnx")
     runtime = pytest.importorskip("onnxruntime")
+    onnx = pytest.importorskip("onnx")
     detector, count = small.detector(kind), 2
     arguments: tuple[Any, ...] = (small.projections(count),)
     inputs = {"projection": arguments[0]}
@@ -429,6 +440,17 @@ def test_onnx_files_give_the_same_boxes(kind, tmp_path):
         session = runtime.InferenceSession(tmp_path / file)
         names = [output.name for output in session.get_outputs()]
         return dict(zip(names, session.run(None, feed), strict=True))
+
+    for file in ("network.onnx", "detector.onnx"):
+        model = onnx.load(tmp_path / file)
+        onnx.checker.check_model(model, full_check=True)
+        versions = [(x.domain, x.version) for x in model.opset_import]
+        assert (model.ir_version, versions) == (8, [("", 18)])
+        assert {node.domain for node in model.graph.node} == {""}
+        constants = {array.name for array in model.graph.initializer}
+        kernels = [x.input[1] for x in model.graph.node if x.op_type == "Conv"]
+        assert len(kernels) > 5
+        assert constants.issuperset(kernels)  # as the quantization needs it
 
     for score, roi in ((0.1, (-99, 99) * 3), (0.5, (0, 20, -5, 5, -9, 9))):
         settings = {"score_threshold": score, "nms_iou": 0.3, "roi": roi}
@@ -452,6 +474,10 @@ def test_onnx_files_give_the_same_boxes(kind, tmp_path):
     assert json.loads(told["decode"])["score_threshold"] == 0.1
     assert json.loads(told["grid"]) == detector.grid.to_dict()
     assert json.loads(told["radejax"]) == radejax.__version__
+    assert json.loads(told["onnxruntime"]) == ">=1.19"
+    assert "(opset 18, for ONNX Runtime 1.19 or newer)" in (
+        tmp_path / "README.md"
+    ).read_text(encoding="utf-8")
     for name, value in (("score_threshold", 0.1), ("roi", (20, 0, -5, 5, -9, 9))):
         feed[name] = np.asarray(value, np.float32)  # as the page says, no error
     assert not run("detector.onnx", inputs | feed)["is_valid"].any()
@@ -461,6 +487,22 @@ def test_onnx_files_give_the_same_boxes(kind, tmp_path):
     assert [row["name"] for row in rows] == [x.name for x in session.get_outputs()]
     for name, values in run("network.onnx", inputs).items():
         np.testing.assert_allclose(values, getattr(maps, name), atol=1e-4)
+
+
+def test_a_program_in_bfloat16_is_lowered_for_accelerators(tmp_path):
+    detector = small.detector(dtype="bfloat16")
+    export.export(detector, tmp_path, platforms=("cuda", "tpu"), batch_size=1)
+    exported = jax.export.deserialize((tmp_path / "detector.stablehlo").read_bytes())
+    assert exported.platforms == ("cuda", "tpu")
+    found = re.findall(r"stablehlo.convolution.*: (.*) ->", exported.mlir_module())
+    assert len(found) > 5
+    assert all(types.count("xbf16>") == 2 for types in found)
+    assert {str(x.dtype) for x in exported.in_avals} == {"float32"}
+    assert "computes in bfloat16" in (tmp_path / "README.md").read_text()
+    config = json.loads((tmp_path / "config.json").read_text())
+    assert config["config"]["model"]["dtype"] == "bfloat16"
+    export.export(small.detector(), tmp_path, platforms=("cuda",), batch_size=1)
+    assert "bfloat16" not in (tmp_path / "README.md").read_text()
 
 
 def _documented(part):
