@@ -29,6 +29,7 @@ from radejax.core.options import (
     Options,
     Seed,
     as_tuples,
+    class_thresholds,
     did_you_mean,
     find_function,
 )
@@ -100,6 +101,8 @@ class Config(Options):
         classes = f"{len(self.classes)}, the number of config.classes"
         is_equal = count == len(self.classes)
         require(is_equal, "config.model.num_classes", count, classes)
+        least, name = self.decode.score_threshold, "config.decode.score_threshold"
+        class_thresholds(least, self.classes, least, name)
         if self.train.evaluate_every_epochs:
             ious = self.evaluation.iou_thresholds
             known = [

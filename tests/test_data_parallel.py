@@ -16,9 +16,9 @@ import optax
 import pytest
 
 from radejax import models
+from radejax.config import Config
 from radejax.core import devices
 from radejax.core.structures import Batch
-from radejax.detection.decode import DecodeOptions
 from radejax.inference.inputs import Settings
 from radejax.training.step import create_state, make_train_step
 
@@ -147,7 +147,7 @@ def test_only_parameters_are_gathered_if_they_are_split(kind: str) -> None:
 
 def test_devices_share_the_work_of_inference_and_gather_only_detections() -> None:
     inputs = _case("dinorade")[1].model_inputs()
-    settings = Settings.of(DecodeOptions(score_threshold=0.1), {})
+    settings = Settings.of(Config(), {"score_threshold": 0.1})
     programs = []
     for num_devices in (1, 4):
         mesh = devices.make_mesh(num_devices)

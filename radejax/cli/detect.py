@@ -32,11 +32,7 @@ _MAX_LISTED = 20
 @entry.step
 @entry.part
 @entry.camera_calibration
-@click.option(
-    "--score-threshold",
-    type=entry.FRACTION,
-    help="Score threshold. Default: the config's.",
-)
+@entry.score_threshold("Score threshold, or some by class. Default: the config's.")
 @click.option(
     "--nms-iou",
     type=entry.FRACTION,
@@ -158,8 +154,21 @@ def detect(
 @click.option(
     "--half", is_flag=True, help="Store weights as float16 (huggingface only)."
 )
+@click.option(
+    "--thresholds",
+    type=click.Choice(["best_f1", "wanted_precision"]),
+    help="Write the score thresholds into the model that `radejax evaluate` chose. Default: "
+    "the config's.",
+)
 def export(
-    source: str, out: pathlib.Path, int8: bool, roots: tuple[str, ...], **settings: Any
+    source: str,
+    out: pathlib.Path,
+    image_backbone: str | None,
+    dtype: str | None,
+    thresholds: str | None,
+    int8: bool,
+    roots: tuple[str, ...],
+    **settings: Any,
 ) -> None:
     """Export a model as a folder for other programs.
 
@@ -171,12 +180,15 @@ def export(
     Example: radejax export runs/quickstart --out exported
     """
     from radejax.inference import export as exporting
+    from radejax.inference.saved import load_model, with_chosen_thresholds
 
     entry.set_up_jax()
-    options = {name: settings.pop(name) for name in ("image_backbone", "dtype")}
-    detector = radejax.Detector.from_workdir(source, **options)
     if roots and not int8:
         raise UserError("--data is only used with --int8")
+    saved = load_model(source, image_backbone=image_backbone)
+    if thresholds:
+        saved = with_chosen_thresholds(saved, source, thresholds)
+    detector = radejax.Detector(saved, dtype=dtype)
     if int8:
         from radejax.runs.quantize import export_int8
 

@@ -276,6 +276,12 @@ def together(*options: Decorator, group: str = "Options") -> Decorator:
     return decorate
 
 
+def score_threshold(meaning: str) -> Decorator:
+    """Returns the option `--score-threshold`, see `options.class_thresholds`."""
+    metavar = "NUMBER|CLASS=NUMBER,..."
+    return click.option("--score-threshold", metavar=metavar, help=meaning)
+
+
 def out_file(default: str, meaning: str) -> Decorator:
     """Returns the option `--out` for the file to write."""
     return click.option("--out", type=FILE, default=default, help=meaning)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import importlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -28,6 +29,11 @@ NotNegative = Annotated[float, Ge(0)]
 Fraction = Annotated[float, Ge(0), Le(1)]
 BelowOne = Annotated[float, Ge(0), Lt(1)]
 Seed = Annotated[int, Ge(0), Lt(1 << 32)]
+ScoreThreshold = Fraction | tuple[Fraction, ...]
+"""One score threshold for all classes, or one per class in their order."""
+
+ClassThresholds = float | Sequence[float] | Mapping[str, float] | str
+"""`ScoreThreshold`, thresholds by class name, or a text, see `class_thresholds`."""
 
 _WORDS = (
     ("greater than or equal to", "at least"),
@@ -202,6 +208,51 @@ def _expected(error: ErrorDetails) -> str:
         kind = "an integer" if isinstance(limits[limit], int) else "a number"
         text = f"{kind} {'of ' * text.startswith('at ')}{text}"
     return text
+
+
+def class_thresholds(
+    given: ClassThresholds,
+    classes: Sequence[str],
+    default: ScoreThreshold,
+    name: str = "score_threshold",
+) -> ScoreThreshold:
+    """Returns one score threshold for all classes, or one per class.
+
+    Args:
+        given: One threshold; one per class; those of some classes by name; or a text such
+            as "0.3", "Sedan=0.4,Bicycle=0.2", or "0.3,Bicycle=0.2" with the threshold of all
+            other classes.
+        classes: Names of the classes.
+        default: Thresholds of the classes that are not named.
+        name: Name of the option in messages.
+
+    Raises:
+        UserError: A class is unknown, the number of thresholds is not that of the classes,
+            or one is not a number from 0 to 1.
+
+    Examples:
+        >>> class_thresholds("Bicycle=0.2", ["Sedan", "Bicycle"], 0.3)
+        (0.3, 0.2)
+    """
+    values: Any = given
+    array = np.full((), np.nan)  # of values that are not numbers
+    with contextlib.suppress(TypeError, ValueError):
+        if isinstance(values, str):
+            pairs = [part.rpartition("=") for part in values.split(",")]
+            values = {cls.strip(): float(number) for cls, _, number in pairs}
+            if len(values) < len(pairs):
+                raise ValueError("a class is named twice")
+            default = values.pop("", default)
+        if isinstance(values, Mapping):
+            usual = np.broadcast_to(default, len(classes)).tolist()
+            every = dict(zip(classes, usual, strict=True)) | dict(values)
+            values = tuple(every.values()) if values else default
+        array = np.asarray(values, np.float64)
+    is_fine = array.shape in ((), (len(classes),))
+    is_fine = is_fine and bool(((array >= 0) & (array <= 1)).all())
+    count = f"{len(classes)} of them, or CLASS=NUMBER of {', '.join(classes)}"
+    require(is_fine, name, given, f"a number from 0 to 1, {count}")
+    return tuple(array.tolist()) if array.ndim else float(array)
 
 
 def find_part(

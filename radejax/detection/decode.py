@@ -18,13 +18,14 @@ from flax import struct
 from jaxtyping import Bool, Float, Int, Num, Real, Shaped
 
 from radejax.core.errors import require
-from radejax.core.options import AtLeastOne, Fraction, Options
+from radejax.core.options import AtLeastOne, Fraction, Options, ScoreThreshold
 from radejax.core.structures import MIN_SIZE_M, Array, DetectionMaps, Detections
 from radejax.detection.nms import rotated_nms
 from radejax.geometry.boxes import boxes7_from_8
 from radejax.geometry.radar_grid import RadarGrid
 
 Scalar = float | Float[Array, ""]
+Thresholds = Scalar | Sequence[float] | Float[Array, " C"]
 Roi = Real[Array, "6"] | Sequence[Scalar]
 RawYaw = Literal["nms", "always", "never"]
 
@@ -34,8 +35,8 @@ class DecodeOptions(Options, section="config.decode"):
 
     max_detections: AtLeastOne = 100
     """Rows of the output per frame."""
-    score_threshold: Fraction = 0.3
-    """Score threshold."""
+    score_threshold: ScoreThreshold = 0.3
+    """Score threshold of all classes, or one per class in their order."""
     threshold_inclusive: bool = True
     """Keep scores equal to the threshold, as in the paper; the released code does not."""
     nms_iou: Fraction = 0.3
@@ -100,7 +101,7 @@ def decode(
     grid: RadarGrid,
     options: DecodeOptions,
     *,
-    score_threshold: Scalar | None = None,
+    score_threshold: Thresholds | None = None,
     nms_iou: Scalar | None = None,
     roi: Roi | None = None,
     pre_nms: int | None = None,
@@ -118,8 +119,8 @@ def decode(
         grid: The grid of the maps.
         options: Options, which are constants under `jit`. The result has
             K = `max_detections` rows, or fewer if fewer peaks can enter NMS.
-        score_threshold: Score that a peak must reach; may be traced, as may the next two.
-            Each replaces the value in `options` unless it is None.
+        score_threshold: Score that a peak must reach, one or `[C]`; may be traced, as may the
+            next two. Each replaces the value in `options` unless it is None.
         nms_iou: IoU at or above which the box with the lower score is removed.
         roi: `[6]` region (x0, x1, y0, y1, z0, z1) in meters, including its bounds.
         pre_nms: Maximum number of peaks that enter NMS, those with the highest scores;
@@ -206,7 +207,7 @@ def find_peaks(
     grid: RadarGrid,
     *,
     max_peaks: int,
-    score_threshold: Scalar,
+    score_threshold: Thresholds,
     roi: Roi | None = None,
     threshold_inclusive: bool = True,
 ) -> Peaks:
@@ -235,7 +236,9 @@ def find_peaks(
     num_azimuth = maps.heatmap_logits.shape[2]
     scores = jax.nn.sigmoid(maps.heatmap_logits.astype(jnp.float32))
     passes = jnp.greater_equal if threshold_inclusive else jnp.greater
-    is_peak = passes(scores, score_threshold) & (scores >= _max_3x3(scores))
+    least = jnp.asarray(score_threshold, scores.dtype)
+    least = jnp.broadcast_to(least, scores.shape[-1:])[None, None, None]
+    is_peak = passes(scores, least) & (scores >= _max_3x3(scores))
     scores = jnp.where(is_peak, scores, 0.0)
     best = jnp.max(scores, axis=-1)  # [B, R, A]
     if roi is not None:

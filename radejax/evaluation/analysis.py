@@ -20,6 +20,7 @@ from radejax.evaluation.boxes import Columns
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import pooled_curve
 from radejax.evaluation.results import Metric, condition_masks
+from radejax.evaluation.scores import reliability
 from radejax.geometry.boxes import MIN_OBJECTS, find_size_problem
 
 DISTANCES_M = (0.0, 20.0, 40.0, 60.0, 80.0, float("inf"))
@@ -45,8 +46,10 @@ def subsets(data: EvaluationSet, frames: Columns, iou: float) -> dict[str, list[
         For each kind of subset, one entry per subset and class. An entry contains the
         name of the subset (under the name of the kind), "cls", "ap" (`all_point`, 3D, 0
         to 100, NaN without objects), "precision" and "recall" above the operating score,
-        the number of objects "num_gt", and the number of predictions above the operating
-        score "num_det".
+        the number of objects "num_gt", the number of predictions above the operating score
+        "num_det", and the expected calibration errors of the scores of all predictions,
+        "score_error", and of their probabilities, "probability_error", if there are any. The
+        distance "all" is that of all boxes.
 
     Examples:
         >>> car = {"frame": [0], "box": [[20.0, 0, 0, 4, 2, 1.5, 0]], "cls": ["Sedan"]}
@@ -55,7 +58,8 @@ def subsets(data: EvaluationSet, frames: Columns, iou: float) -> dict[str, list[
         100.0
     """
     match = data.matched_objects("plain", "free", "3d", iou)
-    kinds = {"distance": _by_distance(data, match)}
+    everything = np.ones(len(data.gt), bool), np.ones(len(data.pred), bool)
+    kinds = {"distance": {"all": everything} | _by_distance(data, match)}
     for kind in ("weather", "environment", "time"):
         kinds[kind] = {
             name: (mask[data.gt.frame], mask[data.pred.frame])
@@ -117,12 +121,15 @@ def _numbers(
     above = score > OPERATING_SCORE
     num_det = int(above.sum())
     found = int(is_tp[above].sum())
+    confidences = data.confidences().items()
+    errors = {f"{n}_error": reliability(x[order], is_tp).error for n, x in confidences}
     return {
         "ap": curve.ap,
         "precision": found / num_det if num_det else math.nan,
         "recall": found / num_gt if num_gt else math.nan,
         "num_gt": num_gt,
         "num_det": num_det,
+        **errors,
     }
 
 

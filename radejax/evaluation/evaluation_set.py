@@ -224,7 +224,8 @@ class EvaluationSet:
         row = np.flatnonzero(is_class & is_inside)
         row = row[np.lexsort((row, cls[row], position[row]))]
         score = None if table.score is None else table.score[row]
-        return Boxes(position[row], table.box[row], cls[row], score), row
+        extras = {name: x[row] for name, x in table.extras.items()}
+        return Boxes(position[row], table.box[row], cls[row], score, extras), row
 
     def _count(self, group: Int[np.ndarray, " N"]) -> Int[np.ndarray, "F C"]:
         """Returns the number of boxes of every class in every frame."""
@@ -325,6 +326,11 @@ class EvaluationSet:
             return matching.match_best(pairs, self.score, iou)
         num_gt = len(self.gt)
         return matching.match_free(pairs, self.score, self.pred_group, num_gt, iou)
+
+    def confidences(self) -> dict[str, Float[np.ndarray, " M"]]:
+        """Returns the scores and, of a calibrated model, the probabilities by name."""
+        extras = self.pred.extras.items()
+        return {"score": self.score} | {n: x for n, x in extras if n == "probability"}
 
     @functools.cached_property
     def by_score(self) -> Int[np.ndarray, " M"]:

@@ -29,13 +29,14 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Shaped
 from tabulate import LATEX_ESCAPE_RULES, tabulate
 
 from radejax.core import files
 from radejax.core.files import JsonObject, PathLike
 from radejax.core.version import __version__, radejax_commit
 from radejax.data.kradar.conditions import WEATHERS
-from radejax.evaluation import analysis, protocols
+from radejax.evaluation import analysis, protocols, scores
 from radejax.evaluation.boxes import AnyBoxes, Columns, roi_name, write_boxes
 from radejax.evaluation.evaluation_set import EvaluationSet, Result
 from radejax.evaluation.html import SceneFigure, write_html
@@ -52,7 +53,7 @@ from radejax.evaluation.results import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-STALE = ("kitti", "precision_recall_*")
+STALE = ("kitti", "precision_recall_*", "reliability.*", "thresholds.*")
 """Patterns of the names of what only some reports contain."""
 
 
@@ -85,6 +86,7 @@ def write_report(
     data_name: str | None = None,
     left_out: Mapping[str, int] | None = None,
     warnings: Sequence[str] = (),
+    choosing: EvaluationSet | None = None,
     draw_scenes: Callable[[EvaluationSet, pathlib.Path], Iterable[SceneFigure]]
     | None = None,
 ) -> Report:
@@ -103,6 +105,8 @@ def write_report(
         data_name: Name of the data set; None if it is not known.
         left_out: Counts of what was read and skipped when loading, by reason.
         warnings: Warnings of loading, which are printed in the report.
+        choosing: Validation split, on which score thresholds are chosen. If None, they are
+            chosen on the evaluated frames, except on those of a test split.
         draw_scenes: Function from the evaluation set and the folder to the figures of frames
             for `report.html`; none if None.
 
@@ -143,6 +147,7 @@ def write_report(
         else "none: they need --bootstrap and frames of two sequences or more",
         "ap": [to_row(result) for result in results],
         "subsets": subsets | analysis.subsets(data, frames, iou),
+        "thresholds": _thresholds(data, choosing, splits, options),
         "box_errors": analysis.box_errors(data, iou, options.find_metrics()),
         "mistakes": _mistake_counts(data, iou),
         "worst_frames": analysis.worst_frames(data, frames, iou),
@@ -177,7 +182,12 @@ def write_report(
         origin = f"{run}, {describe(metrics)}"
         curves = {}
         if options.plots:
-            curves = _draw_curves(data, frames, options, folder, origin)
+            from radejax.visualize.style import save_figure
+
+            curves = _draw_curves(data, frames, options)
+            curves |= _draw_scores(data, metrics["thresholds"]["chosen"], options)
+            for name, figure in curves.items():
+                save_figure(figure, folder / f"{name}.{options.figures}", origin)
         scenes = () if draw_scenes is None else draw_scenes(data, folder)
         write_html(folder / "report.html", metrics, built, curves, scenes)
     return Report(text, metrics, results, pathlib.Path(out_dir))
@@ -195,6 +205,7 @@ def _all_tables(metrics: JsonObject, tables: RunTables) -> list[Table]:
     for protocol, iou in itertools.product(options.protocols, options.iou_thresholds):
         built.append(tables.by_weather(protocol, iou))
     built += [subset_table(subsets, kind) for kind in subsets if kind != "protocol"]
+    built += threshold_tables(metrics["thresholds"], options)
     built.append(error_table(metrics["box_errors"]))
     title = f"Mistakes in 3D at IoU {options.iou_thresholds[0]:g} and score>"
     title += f"{analysis.OPERATING_SCORE:g}"
@@ -217,6 +228,7 @@ def _console_text(metrics: JsonObject, tables: RunTables) -> str:
     built += [tables.by_weather(protocol, iou) for protocol in others]
     built += [tables.by_protocol(space, iou) for space in SPACES]
     built.append(subset_table(metrics["subsets"], "distance"))
+    built.append(threshold_tables(metrics["thresholds"], options)[0])
     built.append(error_table(metrics["box_errors"]))
     kind = "simulated " if metrics["is_simulated"] else ""
     parts = [
@@ -246,11 +258,7 @@ def describe(metrics: JsonObject) -> str:
 
 
 def _draw_curves(
-    data: EvaluationSet,
-    frames: Columns,
-    options: ReportOptions,
-    folder: pathlib.Path,
-    origin: str,
+    data: EvaluationSet, frames: Columns, options: ReportOptions
 ) -> dict[str, Figure]:
     """Draws precision over recall for each weather, one curve per class with objects.
 
@@ -259,7 +267,6 @@ def _draw_curves(
     """
     # Imported here, as matplotlib takes a second to load and is not always needed.
     from radejax.visualize.curves import Curve, draw_precision_recall
-    from radejax.visualize.style import save_figure
 
     protocol = protocols.RECOMMENDED
     iou = options.iou_thresholds[0]
@@ -280,8 +287,88 @@ def _draw_curves(
         title = f"{protocol}, {space.upper()}, IoU {iou:g}{suffix}"
         name = f"precision_recall_{space}_iou{100 * iou:.4g}"
         figures[name] = draw_precision_recall(panels, title)
-        save_figure(figures[name], folder / f"{name}.{options.figures}", origin)
     return figures
+
+
+def _class_curves(data: EvaluationSet, options: ReportOptions) -> list[Result]:
+    """Returns the curves in `all_point` and 3D of the classes that occur."""
+    protocol = protocols.RECOMMENDED
+    iou = options.iou_thresholds[0]
+    settings = options.settings_of(protocol)
+    results = data.results(protocol, iou_thresholds=iou, spaces="3d", **settings)
+    return [result for result in results if result.is_defined]
+
+
+def _thresholds(
+    data: EvaluationSet,
+    choosing: EvaluationSet | None,
+    splits: Shaped[np.ndarray, " S"],
+    options: ReportOptions,
+) -> JsonObject:
+    """Chooses score thresholds, and computes the rates at these and others.
+
+    Returns:
+        "chosen_on", the frames on which thresholds were chosen, or None; and entries with
+        class, threshold and rates: "chosen" ones, with their "rule", and "rates".
+    """
+    chosen_on = "the validation split"
+    if choosing is None and "test" not in splits:
+        choosing, chosen_on = data, "the evaluated frames themselves"
+    points: dict[str, dict[str, float]] = {}
+    for curve in [] if choosing is None else _class_curves(choosing, options):
+        chosen = scores.choose_thresholds(curve, options.wanted_precision)
+        points[curve.cls] = chosen
+    entries: list[analysis.Entry] = []
+    for curve in _class_curves(data, options):
+        rules = points.get(curve.cls, {}) | {
+            f"{i / 20:g}": i / 20 for i in range(1, 20)
+        }
+        rates = scores.rates_at(curve, [*rules.values()])
+        for i, (rule, threshold) in enumerate(rules.items()):
+            entry: analysis.Entry = {"cls": curve.cls, "rule": rule}
+            entry |= {"threshold": threshold}
+            entries.append(entry | {name: float(x[i]) for name, x in rates.items()})
+    return {
+        "chosen_on": None if choosing is None else chosen_on,
+        "chosen": [entry for entry in entries if entry["rule"] in scores.RULES],
+        "rates": [entry for entry in entries if entry["rule"] not in scores.RULES],
+    }
+
+
+def _draw_scores(
+    data: EvaluationSet,
+    chosen: Sequence[analysis.Entry],
+    options: ReportOptions,
+) -> dict[str, Figure]:
+    """Draws the rates over score thresholds, and reliability diagrams, of every class."""
+    from radejax.visualize.curves import Curve, draw_precision_recall
+
+    iou = options.iou_thresholds[0]
+    over = np.linspace(0, 1, 201)
+    is_matched = data.matched_objects("plain", "free", "3d", iou) >= 0
+    rates: dict[str, dict[str, Curve]] = {}
+    diagrams: dict[str, dict[str, Curve]] = {}
+    for curve in _class_curves(data, options):
+        columns = scores.rates_at(curve, over).items()
+        rates[curve.cls] = {name: (over, column) for name, column in columns}
+        for entry in chosen:
+            if entry["cls"] == curve.cls:
+                at = entry["threshold"]
+                rates[curve.cls][f"{entry['rule']}: {at:g}"] = [at, at], [0, 1]
+        rows = data.pred.cls == data.classes.index(curve.cls)
+        diagrams[curve.cls] = {"calibrated": ([0, 1], [0, 1])}
+        for name, x in data.confidences().items():
+            found = scores.reliability(x[rows], is_matched[rows])
+            label = f"{name}: calibration error {number(found.error, digits=3)}"
+            diagrams[curve.cls][label] = found.confidence, found.precision
+    if not rates:
+        return {}
+    suffix = f", 3D, IoU {iou:g}{', simulated data' if data.is_simulated else ''}"
+    labels = "confidence", "precision"
+    reliability = draw_precision_recall(diagrams, f"Reliability{suffix}", labels)
+    labels = "score threshold", "rate"
+    thresholds = draw_precision_recall(rates, f"Score thresholds{suffix}", labels)
+    return {"thresholds": thresholds, "reliability": reliability}
 
 
 def _mistake_counts(data: EvaluationSet, iou: float) -> list[analysis.Entry]:
@@ -416,8 +503,21 @@ def subset_table(subsets: JsonObject, kind: str) -> Table:
     """Builds the table of AP, precision and recall per subset and class with boxes."""
     title = f"By {kind}, {subsets['protocol']}"
     entries = [entry for entry in subsets[kind] if entry["num_gt"] or entry["num_det"]]
-    names = [kind, "cls", "ap", "precision", "recall", "num_gt"]
+    names = [kind, "cls", "ap", "precision", "recall", "num_gt", "score_error"]
+    names += ["probability_error"] * ("probability_error" in subsets[kind][0])
     return _table_of(f"by-{kind}", title, entries, names)
+
+
+def threshold_tables(thresholds: JsonObject, options: ReportOptions) -> list[Table]:
+    """Builds the tables of the rates at chosen score thresholds and at all."""
+    chosen_on = thresholds["chosen_on"] or "no frames, for lack of a validation split"
+    terms = f"3D at IoU {options.iou_thresholds[0]:g}"
+    title = f"Score thresholds in {terms} for the best F1 and a precision of "
+    title += f"{options.wanted_precision:g}, chosen on {chosen_on}"
+    names = ["cls", "threshold", "precision", "recall", "f1"]
+    chosen = _table_of("thresholds", title, thresholds["chosen"], [*names, "rule"])
+    title = f"Rates at score thresholds in {terms}"
+    return [chosen, _table_of("rates", title, thresholds["rates"], names)]
 
 
 def error_table(errors: Mapping[str, Mapping[str, float]]) -> Table:

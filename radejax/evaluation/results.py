@@ -69,6 +69,8 @@ class EvaluationOptions(Options, section="config.evaluation"):
     """Score threshold of all protocols except all_point."""
     min_score: Fraction = 0.05
     """Predictions below this score are not stored."""
+    wanted_precision: Fraction = 0.9
+    """Precision for which a report chooses score thresholds, besides those of the best F1."""
     bootstrap: Count = 0
     """Number of bootstrap resamples of sequences for 95 % confidence intervals; 0: no
     intervals."""
@@ -172,7 +174,7 @@ class ReportOptions(EvaluationOptions):
 
 SAME_NUMBERS = frozenset(
     ["bootstrap", "batch_size", "num_visualizations", "figures", "plots", "kitti"]
-)
+).union(["wanted_precision"])
 """Options of an evaluation that do not change its APs."""
 
 

@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float, PyTree, Real, Shaped
 from radejax import models
 from radejax.core.errors import require
 from radejax.core.files import PathLike
+from radejax.core.options import ClassThresholds
 from radejax.core.structures import Array, Batch, Detections, to_float
 from radejax.data import projection
 from radejax.data.cameras import no_images
@@ -94,7 +95,8 @@ class Detector:
             places batches on JAX's default device. With several processes, each passes
             the same number of frames, a multiple of its devices, and gets the detections
             of all processes.
-        score_threshold: Default score threshold of calls; the config's if None.
+        score_threshold: Default score threshold of calls: one, one per class, or those of
+            some classes by name, such as `{"Pedestrian": 0.2}`; the config's if None.
         nms_iou: Default IoU threshold of NMS of calls; the config's if None.
         roi: Default region of interest of calls, in meters: limits
             `(x0, x1, y0, y1, z0, z1)`, "narrow" or "wide"; the config's if None.
@@ -124,13 +126,13 @@ class Detector:
         saved: SavedModel,
         sharding: Sharding | None = None,
         *,
-        score_threshold: float | None = None,
+        score_threshold: ClassThresholds | None = None,
         nms_iou: float | None = None,
         roi: Sequence[float] | str | None = None,
         dtype: str | None = None,
         batch_sizes: Sequence[int] = (1, 2, 4, 8, 16, 32),
     ) -> None:
-        changes = reading.check_settings(score_threshold, nms_iou, roi)
+        changes = reading.check_settings(saved.config, score_threshold, nms_iou, roi)
         config = saved.config.replace(decode=changes)
         if dtype is not None:
             config = config.replace(model={"dtype": dtype})
@@ -262,7 +264,7 @@ class Detector:
         image: Images | None = None,
         camera: Calibrations | None = None,
         *,
-        score_threshold: float | None = None,
+        score_threshold: ClassThresholds | None = None,
         nms_iou: float | None = None,
         roi: Sequence[float] | str | None = None,
     ) -> Detections:
@@ -289,8 +291,9 @@ class Detector:
             UserError: A shape, a number of images or cameras, or a setting is not as
                 expected.
         """
-        changes = reading.check_settings(score_threshold, nms_iou, roi)
-        settings = Settings.of(self.decode_options, changes)
+        config = self.saved.config
+        changes = reading.check_settings(config, score_threshold, nms_iou, roi)
+        settings = Settings.of(config, changes)
         is_checked = True  # the content of a batch was checked when it was created
         if isinstance(frames, Batch):
             inputs = Inputs(frames.projection, frames.image, frames.camera)

@@ -21,6 +21,7 @@ from typing import Any
 import jax
 import jax.export  # not a part of `import jax`
 import jax.numpy as jnp
+import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 from flax.typing import MutableVariableDict, VariableDict
 from jax.typing import DTypeLike
@@ -258,6 +259,11 @@ def _origin(content: JsonObject) -> str:
     """Return the rows of a table of what identifies a model."""
     known = {"run": "not known", "metrics": None} | content["identity"]
     known["export"] = {"radejax": content["radejax"], "commit": content["commit"]}
+    classes = content["config"]["classes"]
+    least = np.broadcast_to(
+        content["config"]["decode"]["score_threshold"], len(classes)
+    )
+    known["score threshold"] = dict(zip(classes, least.tolist(), strict=True))
     values = flatten_dict(known, sep=" ").items()
     texts = {n: f"{x:.4g}" if isinstance(x, float) else x for n, x in values}
     rows = (f"| {n} | {'none' if x is None else x} |" for n, x in texts.items())
@@ -273,8 +279,10 @@ def _array(*shape: int, dtype: DTypeLike = jnp.float32) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct(shape, dtype)
 
 
-_SETTINGS = {"score_threshold": _array(), "nms_iou": _array(), "roi": _array(6)}
-"""Shapes of the fields of `Settings`, in their order."""
+def _settings(detector: Detector) -> dict[str, jax.ShapeDtypeStruct]:
+    """Return the shapes of the fields of `Settings`, in their order."""
+    given = Settings.of(detector.saved.config, {})
+    return {n: _array(*x.shape) for n, x in given._asdict().items()}
 
 
 def _exported(
@@ -318,7 +326,7 @@ _UNITS = {
     "camera_is_valid": "whether the frame has an image",
     "camera_max_radius": "tangent of the viewing angle",
     "camera_size_px": "width, height in pixels",
-    "score_threshold": "0 to 1",
+    "score_threshold": "0 to 1, by class",
     "nms_iou": "0 to 1",
     "roi": "x0, x1, y0, y1, z0, z1 in m",
     "boxes": "x, y, z, length, width, height in m, yaw in rad",
@@ -408,9 +416,10 @@ def _stablehlo(
 
     weights = {name: _array(*x.shape) for name, x in flat.items()}
     export_of = jax.export.export(jax.jit(program), platforms=tuple(platforms))
+    settings = _settings(detector)
     with _without_locations():
-        exported = export_of(weights, inputs, *_SETTINGS.values())
-    names = [*sorted(weights), *_names(inputs), *_SETTINGS]
+        exported = export_of(weights, inputs, *settings.values())
+    names = [*sorted(weights), *_names(inputs), *settings]
     kept = exported.module_kept_var_idx  # a program has only the inputs that it uses
     used = [(names[i], exported.in_avals[i]) for i in kept]
     results = jax.tree.unflatten(exported.out_tree, exported.out_avals)
@@ -519,7 +528,7 @@ def _onnx_files(
             converted.metadata_props.add(key=name, value=json.dumps(value))
         return bytes(converted.SerializeToString())
 
-    every = inputs | _SETTINGS
+    every = inputs | _settings(detector)
     shapes_of = jax.eval_shape(program, *every.values())
     names = [*RESULTS, *sorted(shapes_of.keys() - set(RESULTS))]
     results = {name: shapes_of[name] for name in names}

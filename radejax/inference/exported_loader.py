@@ -118,8 +118,8 @@ def load(
 ) -> Callable[..., dict[str, Any]]:
     """Loads the detector of an exported folder as a function `detect(projection, ...)`.
 
-    The function returns a dictionary of arrays. Its keyword arguments `score_threshold`,
-    `nms_iou` and `roi` replace the defaults.
+    The function returns a dictionary of arrays. Its keyword arguments `score_threshold` (one
+    number, or one per class), `nms_iou` and `roi` replace the defaults.
 
     Args:
         folder: The folder.
@@ -142,6 +142,7 @@ def load(
     decode = config["config"]["decode"]
     defaults = {name: decode[name] for name in ("score_threshold", "nms_iou")}
     defaults["roi"] = decode.get("roi") or [-np.inf, np.inf] * 3
+    classes = len(config["config"]["classes"])
 
     def detect(*inputs: object, **settings: object) -> dict[str, Any]:
         if unknown := set(settings) - set(defaults):
@@ -149,8 +150,12 @@ def load(
         given = {**defaults, **settings}
         values = [np.asarray(x, np.float32) for x in given.values()]
         for name, value in zip(given, values[:2], strict=False):
-            if not 0 <= value <= 1:  # also if it is NaN
+            if not ((value >= 0) & (value <= 1)).all():  # also if it is NaN
                 raise ValueError(f"{name} {value}: expected a number from 0 to 1")
+        if values[0].shape not in ((), (classes,)):
+            expected = f"one number, or {classes}, one per class"
+            raise ValueError(f"score_threshold {values[0]}: expected {expected}")
+        values[0] = np.broadcast_to(values[0], classes)
         if not (values[2][::2] < values[2][1::2]).all():
             raise ValueError(f"roi {values[2]}: expected x0 < x1, y0 < y1, z0 < z1")
         return run(inputs, values)

@@ -10,7 +10,7 @@ import dataclasses
 import os
 import pathlib
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,14 +19,16 @@ from flax.typing import VariableDict
 from jaxtyping import Bool, Float, PyTree, Real, UInt8
 
 from radejax import models
+from radejax.config import Config
 from radejax.core.errors import UserError, require
 from radejax.core.files import PathLike, as_path
+from radejax.core.options import ClassThresholds, class_thresholds
 from radejax.core.structures import ROIS, Array
 from radejax.data.cameras import no_camera, read_left_image
 from radejax.data.kradar import reduced
 from radejax.data.kradar.tesseract import read_frame
 from radejax.data.options import CameraOptions, DataOptions
-from radejax.detection.decode import ROI_LIMITS, DecodeOptions, is_roi
+from radejax.detection.decode import ROI_LIMITS, is_roi
 from radejax.geometry.camera import (
     KRADAR_RADAR_FROM_LIDAR_Z_M,
     RADAR_FROM_LIDAR_M,
@@ -324,37 +326,43 @@ UNBOUNDED_ROI = (-np.inf, np.inf, -np.inf, np.inf, -np.inf, np.inf)
 class Settings(NamedTuple):
     """The values of a call that can change without recompilation, see `decode`."""
 
-    score_threshold: Float[Array, ""]
+    score_threshold: Float[Array, " C"]
     nms_iou: Float[Array, ""]
     roi: Float[Array, "6"]
 
     @classmethod
-    def of(cls, options: DecodeOptions, changes: dict[str, object]) -> Settings:
-        """Return the values of options, and those that replace them, as float32 arrays."""
-        values = dict(options) | changes
+    def of(cls, config: Config, changes: dict[str, object]) -> Settings:
+        """Return the values of a config, and those that replace them, as float32 arrays."""
+        values: dict[str, Any] = dict(config.decode) | changes
+        least = np.asarray(values["score_threshold"], np.float32)
         return cls(
-            score_threshold=np.asarray(values["score_threshold"], np.float32),
+            score_threshold=np.broadcast_to(least, len(config.classes)),
             nms_iou=np.asarray(values["nms_iou"], np.float32),
             roi=np.asarray(values["roi"] or UNBOUNDED_ROI, np.float32),
         )
 
 
 def check_settings(
-    score_threshold: float | None,
+    config: Config,
+    score_threshold: ClassThresholds | None,
     nms_iou: float | None,
     roi: Sequence[float] | str | None,
 ) -> dict[str, object]:
-    """Return the given values as fields of `DecodeOptions`, without those that are None.
+    """Return the given values as fields of `config.decode`, without those that are None.
 
     Raises:
-        UserError: A value is out of its range.
+        UserError: A value is out of its range, or a class is unknown.
     """
-    given = {"score_threshold": score_threshold, "nms_iou": nms_iou}
-    numbers = {name: float(x) for name, x in given.items() if x is not None}
-    for name, number in numbers.items():
-        require(0 <= number <= 1, name, number, "a number from 0 to 1")
-    if roi is None:
-        return {**numbers}
-    limits = ROIS.get(roi, ()) if isinstance(roi, str) else tuple(roi)
-    require(is_roi(limits), "roi", roi, f"narrow, wide or {ROI_LIMITS}")
-    return {**numbers, "roi": limits}
+    given: dict[str, object] = {}
+    if score_threshold is not None:
+        usual = config.decode.score_threshold
+        least = class_thresholds(score_threshold, config.classes, usual)
+        given["score_threshold"] = least
+    if nms_iou is not None:
+        given["nms_iou"] = iou = float(nms_iou)
+        require(0 <= iou <= 1, "nms_iou", iou, "a number from 0 to 1")
+    if roi is not None:
+        limits = ROIS.get(roi, ()) if isinstance(roi, str) else tuple(roi)
+        require(is_roi(limits), "roi", roi, f"narrow, wide or {ROI_LIMITS}")
+        given["roi"] = limits
+    return given

@@ -16,7 +16,7 @@ import dataclasses
 import hashlib
 import logging
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -29,6 +29,7 @@ from radejax.config import Config
 from radejax.core import files
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import JsonObject, PathLike
+from radejax.core.options import class_thresholds
 from radejax.core.version import __version__, radejax_commit
 from radejax.data.kradar.labels import LABEL_CLASSES
 from radejax.data.options import CameraOptions, DataOptions
@@ -364,9 +365,8 @@ def _read_checkpoint(path: pathlib.Path, step: Step) -> SavedModel:
 def _identity(workdir: pathlib.Path, step: int, run: JsonObject) -> JsonObject:
     """Return what identifies a checkpoint, without paths of this machine."""
     metrics = None
-    for path in sorted(workdir.glob("evaluation*/metrics.json")):
-        found = files.read_object(path)
-        if metrics is None and (found.get("step"), found["split"]) == (step, "test"):
+    for evaluation, found in _evaluations(workdir, step):
+        if metrics is None and found["split"] == "test":
             first = found["options"]["protocols"][0]
             aps = {
                 row["name"]: row["ap"]
@@ -375,13 +375,65 @@ def _identity(workdir: pathlib.Path, step: int, run: JsonObject) -> JsonObject:
                 and (row["condition"], row["protocol"]) == ("all", first)
             }
             names = ("data", "split", "num_frames")
-            metrics = {"evaluation": path.parent.name, **{n: found[n] for n in names}}
+            metrics = {"evaluation": evaluation, **{n: found[n] for n in names}}
             metrics["ap"] = aps
     wanted = ("date", "commit", "radejax_commit", "versions", "data")
     known = {name: run[name] for name in wanted if name in run}
     is_seed = workdir.name.startswith("seed")  # of `run_seeds`
     name = "/".join(workdir.parts[-2:]) if is_seed else workdir.name
     return {"run": name, "step": step, **known, "metrics": metrics}
+
+
+def _evaluations(
+    workdir: pathlib.Path, step: int | None
+) -> Iterator[tuple[str, JsonObject]]:
+    """Yield the folders of the evaluations of a step and the content of metrics.json."""
+    for path in sorted(workdir.glob("evaluation*/metrics.json")):
+        found = files.read_object(path)
+        if found.get("step") == step:
+            yield path.parent.name, found
+
+
+def with_chosen_thresholds(
+    saved: SavedModel, workdir: PathLike, rule: str
+) -> SavedModel:
+    """Return a model of a run with the score thresholds that an evaluation chose.
+
+    It is the first evaluation that chose them on the validation split, or else on its own
+    frames. Classes without a threshold keep that of the config, which is logged.
+
+    Args:
+        saved: Model of the run.
+        workdir: Workdir of the run.
+        rule: "best_f1" or "wanted_precision", see `scores.choose_thresholds`.
+
+    Raises:
+        UserError: No evaluation of the step chose thresholds.
+    """
+    reports = _evaluations(files.as_path(workdir), saved.step)
+    found = {name: x["thresholds"] for name, x in reports if "thresholds" in x}
+    chosen = [name for name, x in found.items() if x["chosen_on"]]
+    chosen.sort(key=lambda name: found[name]["chosen_on"] != "the validation split")
+    if not chosen:
+        raise UserError(
+            f"{workdir}: no evaluation of step {saved.step} chose score thresholds: "
+            "`radejax evaluate RUN` does so with config.data.validation, or on other labelled "
+            "sequences that --split or --data name"
+        )
+    thresholds = found[chosen[0]]
+    rows = [entry for entry in thresholds["chosen"] if entry["rule"] == rule]
+    by_class = {entry["cls"]: entry["threshold"] for entry in rows}
+    config = saved.config
+    usual = config.decode.score_threshold
+    least = class_thresholds(by_class, config.classes, usual)
+    origin = {"rule": rule, "evaluation": chosen[0]}
+    origin["chosen on"] = thresholds["chosen_on"]
+    _log.info("score thresholds of %s", origin)
+    if kept := [cls for cls in config.classes if cls not in by_class]:
+        _log.warning("%s: no threshold, that of the config is kept", ", ".join(kept))
+    config = config.replace(decode={"score_threshold": least})
+    identity = saved.identity | {"thresholds": origin}
+    return dataclasses.replace(saved, config=config, identity=identity)
 
 
 def _with_backbone(saved: SavedModel, given: PathLike | None) -> SavedModel:

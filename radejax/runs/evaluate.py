@@ -34,7 +34,12 @@ from radejax.evaluation.analysis import (
     mistakes,
     worst_frames,
 )
-from radejax.evaluation.boxes import roi_bounds, roi_name, tables_from_frames
+from radejax.evaluation.boxes import (
+    class_indices,
+    roi_bounds,
+    roi_name,
+    tables_from_frames,
+)
 from radejax.evaluation.evaluation_set import EvaluationSet, Result
 from radejax.evaluation.html import SceneFigure
 from radejax.evaluation.report import STALE, Report, write_report
@@ -214,6 +219,7 @@ class Evaluation:
         out: pathlib.Path | None = None,
         step: int | None = None,
         run: str | None = None,
+        choosing: Evaluation | None = None,
     ) -> Report | None:
         """Detect objects, and write the tables and figures of an evaluation.
 
@@ -224,11 +230,13 @@ class Evaluation:
                 workdir if None.
             step: Step of the variables, which is written to `source.json`.
             run: Name of the run in the report; the workdir's name if None.
+            choosing: Evaluation on the validation split, see `write_report`.
 
         Returns:
             The report that was written; None on all processes except the first.
         """
         predictions = self.predict(variables)
+        others = None if choosing is None else choosing._matched(variables)
         place = out or workdir / "evaluation"
         name = run or workdir.name
         if (before := place / "metrics.json").exists():
@@ -252,6 +260,7 @@ class Evaluation:
                     step=step,
                     data_name=data_name,
                     left_out=self._frames.summary().counts,
+                    choosing=others,
                     draw_scenes=draw_scenes,
                 )
                 _log.info("step %s, split %s\n%s", step, self._split, report.text)
@@ -261,6 +270,10 @@ class Evaluation:
             return dataclasses.replace(report, folder=place)
 
         return devices.main_only(write)
+
+    def _matched(self, variables: VariableDict) -> EvaluationSet:
+        found = self.predict(variables)
+        return make_set(self._truth, found, self._table, self._options)
 
     def _write_camera_share(self, variables: VariableDict, path: pathlib.Path) -> None:
         """Write the mean weight of the camera by weather, computed on up to 256 frames."""
@@ -346,7 +359,10 @@ class Evaluation:
         records = self._data.records
         threshold = self._config.decode.score_threshold
         assert predictions.score is not None
-        is_drawn = (predictions.frame == index) & (predictions.score >= threshold)
+        classes = self._config.classes
+        least = np.broadcast_to(threshold, len(classes))
+        least = least[class_indices(predictions, classes, "predictions")]
+        is_drawn = (predictions.frame == index) & (predictions.score >= least)
         return figures.frame_scene(
             frame,
             decode(records[frame.key]),
@@ -484,8 +500,11 @@ def evaluate_run(
         config, data, split, shuffle_images=shuffle_images, options=options
     )
     place = files.as_path(out or workdir / name)
+    others = None
+    if split == "test" and other is None and config.data.validation:
+        others = Evaluation(config, data, "validation", options=options)
     return evaluation.report(
-        saved.variables, workdir, out=place, step=saved.step, run=run
+        saved.variables, workdir, out=place, step=saved.step, run=run, choosing=others
     )
 
 

@@ -194,7 +194,10 @@ def run(
         # Report -----------------------------------------------------------------------
 
         if has_test:
-            report = evaluation("test").report(state.eval_variables, folder, step=step)
+            others = evaluation("validation") if config.data.validation else None
+            report = evaluation("test").report(
+                state.eval_variables, folder, step=step, choosing=others
+            )
             if report is not None:
                 log_results(folder, step, named_aps(report.results))
     place = files.relative(folder)

@@ -24,9 +24,14 @@ Curve = tuple[ArrayLike, ArrayLike] | None
 
 
 def draw_precision_recall(
-    panels: Mapping[str, Mapping[str, Curve]], title: str = ""
+    panels: Mapping[str, Mapping[str, Curve]],
+    title: str = "",
+    labels: tuple[str, str] | None = None,
 ) -> Figure:
     """Draw interpolated precision over recall, one line per class, condition or model.
+
+    With `labels`, the curves are other values from 0 to 1, such as F1 over the score, and are
+    drawn as they are.
 
     The interpolated precision at a recall is the highest precision at this or a higher
     recall. In the protocol `all_point`, AP is the area under the drawn steps. Lines differ
@@ -37,6 +42,7 @@ def draw_precision_recall(
     Args:
         panels: Curves by name for the title of each panel; at least one panel.
         title: Title of the figure.
+        labels: Labels of the axes of curves that are not interpolated.
     """
     rows = -(-len(panels) // 4)
     columns = -(-len(panels) // rows)
@@ -45,16 +51,20 @@ def draw_precision_recall(
     for ax in axes[len(panels) :]:
         ax.set_axis_off()
     for ax, (name, curves) in zip(axes, panels.items(), strict=False):
-        _draw_panel(ax, curves)
+        _draw_panel(ax, curves, labels)
         ax.set_title(name, fontsize=10)
     figure.suptitle(title)
     return figure
 
 
-def _draw_panel(ax: Axes, curves: Mapping[str, Curve]) -> None:
-    is_empty = True
+def _draw_panel(
+    ax: Axes, curves: Mapping[str, Curve], labels: tuple[str, str] | None
+) -> None:
+    is_empty = labels is None
     for i, (label, curve) in enumerate(curves.items()):
-        if curve is not None:
+        if curve is not None and labels:
+            ax.plot(*curve, label=label, **_line(i))
+        elif curve is not None:
             recall, precision = (np.asarray(values, float) for values in curve)
             order = np.argsort(recall, kind="stable")
             highest = np.maximum.accumulate(precision[order][::-1])[::-1]
@@ -64,7 +74,8 @@ def _draw_panel(ax: Axes, curves: Mapping[str, Curve]) -> None:
             ax.plot(x, y, label=label, drawstyle="steps-pre", **_line(i))
             is_empty = is_empty and not recall.any()
     limits = (0, 1.02)
-    ax.set(xlim=limits, ylim=limits, xlabel="recall", ylabel="interpolated precision")
+    xlabel, ylabel = labels or ("recall", "interpolated precision")
+    ax.set(xlim=limits, ylim=limits, xlabel=xlabel, ylabel=ylabel)
     ax.grid(alpha=0.3)
     if is_empty:
         ax.text(0.5, 0.5, "none found", transform=ax.transAxes, ha="center")

@@ -468,8 +468,10 @@ def _add_legend(
     terms = []
     if scene.score_threshold is not None and scene.predictions is not None:
         scores = scene.predictions.score
-        least = 1.0 if scores is None else float(scores.min(initial=1.0))
-        terms.append(f"score ≥ {min(scene.score_threshold, round(least, 4)):g}")
+        lowest = 1.0 if scores is None else float(scores.min(initial=1.0))
+        least = np.unique(scene.score_threshold)  # ascending
+        ends = [min(least[0], round(lowest, 4)), *least[1:][-1:]]
+        terms.append(f"score ≥ {' to '.join(f'{x:g}' for x in ends)}")
     if scene.matches is not None:
         terms.append(f"IoU > {scene.matches.iou:g}")
     if terms:

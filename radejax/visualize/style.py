@@ -101,8 +101,8 @@ class Scene:
         image: `[H, W, 3]` left front camera image, uint8 or float in [0, 1], or None.
         camera: Calibration of the image, with which boxes are drawn on it; or None.
         title: Title, such as sequence, frame and weather.
-        score_threshold: Score threshold of the predictions for the legend, which names the
-            lowest score instead if it is below; or None.
+        score_threshold: Score threshold of the predictions for the legend, one or one per
+            class, whose lowest score is named instead if it is below; or None.
         time_s: Seconds since the Unix epoch for recordings, or None.
         lidar_m: LiDAR points `[N, 3]` in the radar frame in meters, drawn on ground plane and
             image; or None.
@@ -121,7 +121,7 @@ class Scene:
     image: ArrayLike | None = None
     camera: CameraCalibration | None = None
     title: str = ""
-    score_threshold: float | None = None
+    score_threshold: float | Sequence[float] | None = None
     time_s: float | None = None
     lidar_m: Float[np.ndarray, "N 3"] | None = None
     matches: Matches | None = None

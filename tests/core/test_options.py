@@ -1,7 +1,7 @@
 """Options: changes of them, messages of wrong values, and the parts that they name."""
 
 import pathlib
-from typing import Literal
+from typing import Any, Literal
 
 import pytest
 
@@ -14,6 +14,7 @@ from radejax.core.options import (
     Positive,
     Seed,
     as_tuples,
+    class_thresholds,
     find_part,
 )
 
@@ -109,3 +110,44 @@ def test_parts_are_known_or_imported_and_of_one_kind():
     ):
         with pytest.raises(UserError, match=rf"^config\.x .*{message}"):
             find_part(name, "config.x", known, float)
+
+
+CLASSES = ("Sedan", "Bus or Truck", "Bicycle")
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        (0.4, 0.4),
+        ("0.4", 0.4),
+        ((0.1, 0.2, 1), (0.1, 0.2, 1.0)),
+        ({"Bicycle": 0.2}, (0.3, 0.3, 0.2)),
+        ("Bicycle=0.2", (0.3, 0.3, 0.2)),
+        ("Bus or Truck=0, Sedan=0.4", (0.4, 0.0, 0.3)),
+        ("0.5,Bicycle=0.2", (0.5, 0.5, 0.2)),
+        ({}, 0.3),
+    ],
+)
+def test_score_thresholds_of_classes(given: Any, expected: Any) -> None:
+    assert class_thresholds(given, CLASSES, 0.3) == expected
+
+
+def test_unnamed_classes_keep_their_own_threshold() -> None:
+    assert class_thresholds("Sedan=1", CLASSES, (0.1, 0.2, 0.3)) == (1.0, 0.2, 0.3)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        *(1.5, float("nan"), None, "high", "", "Sedan=", "Sedan=0.4=0.3", "Tram=0.3"),
+        *((0.1, 0.2), (0.1, 0.2, -0.1), {"Tram": 0.3}, {"Sedan": "high"}),
+        *("Sedan=0.4,Sedan=0.5", "Sedan=0.4,,", "0.3,0.4", "nan", "Sedan=nan"),
+    ],
+)
+def test_wrong_score_thresholds_are_one_clear_line(given: Any) -> None:
+    with pytest.raises(UserError) as caught:
+        class_thresholds(given, CLASSES, 0.3)
+    assert str(caught.value) == (
+        f"score_threshold is {given!r}, expected a number from 0 to 1, 3 of them, or "
+        "CLASS=NUMBER of Sedan, Bus or Truck, Bicycle"
+    )

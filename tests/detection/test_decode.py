@@ -165,6 +165,27 @@ def test_peaks_equal_the_definition(seed, inclusive):
     assert not np.asarray(peaks.is_valid[0, count:]).any()
 
 
+def test_every_class_has_its_threshold():
+    """A class whose score is too low leaves its bin to another one."""
+    rng = np.random.default_rng(0)
+    logits = jnp.asarray(rng.normal(0, 2, (1, 20, 12, C)), jnp.float32)
+    maps = DetectionMaps(logits, jnp.zeros((1, 20, 12, 8)))
+    thresholds = np.array([0.9, 0.3, 0.6], np.float32)
+    found = find_peaks(maps, GRID, max_peaks=240, score_threshold=thresholds)
+    # Lower scores of the same class in the neighborhood do not matter.
+    above = np.where(sigmoid(logits) >= thresholds, sigmoid(logits), 0)[0]
+    expected = naive_peaks(above, 1e-6)
+    count = int(found.num_found[0])
+    rows = zip(found.scores[0].tolist(), found.classes[0].tolist(), strict=True)
+    assert [*rows][:count] == [(float(score), cls) for score, cls, *_ in expected]
+    assert {cls for _, cls, *_ in expected} == {0, 1, 2}
+    same, one = (
+        find_peaks(maps, GRID, max_peaks=240, score_threshold=threshold)
+        for threshold in (np.full(C, 0.4, np.float32), 0.4)
+    )
+    jax.tree.map(np.testing.assert_array_equal, same, one)
+
+
 def scattered(num=6, spacing=3, seed=0):
     """Peaks of falling score, apart from each other, with 1 m boxes."""
     rng = np.random.default_rng(seed)

@@ -15,7 +15,7 @@ from radejax.evaluation.results import ReportOptions
 from .scenes import random_scene
 
 STORED = pathlib.Path(__file__).parent / "stored"
-"""Texts that version 0.3 wrote for the scenes of these tests."""
+"""Texts that version 0.3 wrote for the scenes of these tests, with what was added since."""
 
 
 @pytest.fixture(scope="session")

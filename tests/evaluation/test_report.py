@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import DataError, DiskFullError
-from radejax.evaluation import evaluate, report
+from radejax.evaluation import evaluate, report, scores
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files import Source, evaluate_files
 from radejax.evaluation.results import ReportOptions
+
+from .scenes import random_scene
 
 OPTIONS = ReportOptions(roi=None, plots=False, protocols=("all_point",))
 STORED = ReportOptions(
@@ -143,12 +145,43 @@ def test_reports_without_conditions_or_boxes(scene, tmp_path):
         assert path.read_bytes().startswith(b"%PDF")
 
 
+def test_score_thresholds_are_not_chosen_on_a_test_split(scene, tmp_path):
+    truth, found, frames = scene
+    other = EvaluationSet(*random_scene(1, num_frames=30, num_objects=90)[:2])
+    split = {**frames, "split": np.full(30, "test")}
+
+    def thresholds(frames, **options):
+        made = report.write_report(truth, found, frames, tmp_path, OPTIONS, **options)
+        rows = made.metrics["thresholds"]["chosen"]
+        chosen = {row["cls"]: row for row in rows if row["rule"] == "best_f1"}
+        return made.metrics["thresholds"]["chosen_on"], chosen, made.text
+
+    on, chosen, text = thresholds(split)
+    assert (on, chosen) == (None, {})
+    assert "chosen on no frames, for lack of a validation split" in text
+    on, own, _ = thresholds(frames)
+    assert on == "the evaluated frames themselves"
+    on, chosen, text = thresholds(split, choosing=other)
+    assert on == "the validation split"
+    data = EvaluationSet(truth, found, frames=frames)
+    for cls, row in chosen.items():
+        there, here = (
+            next(x for x in part.results("all_point", spaces="3d") if x.cls == cls)
+            for part in (other, data)
+        )
+        threshold = scores.choose_thresholds(there, 0.9)["best_f1"]
+        assert row["threshold"] == threshold
+        assert row["f1"] == scores.rates_at(here, threshold)["f1"] <= own[cls]["f1"]
+        assert re.search(rf"{cls} +{threshold:.2f} .* best_f1", text)
+    assert len(chosen) == 2
+
+
 def test_curves_are_drawn_of_classes_that_occur(scene, tmp_path, monkeypatch):
     from radejax.visualize import curves, style
 
     drawn = []
 
-    def draw(panels, title):
+    def draw(panels, title, *_):
         drawn.append((panels, title))
         return style.new_figure(1, 1)
 

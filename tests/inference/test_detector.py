@@ -73,6 +73,13 @@ def test_thresholds_and_region_change_without_compiling(detector, projections):
     scores = np.asarray(default.scores)[np.asarray(default.is_valid)]
     strict = detector(projections[:1], score_threshold=float(np.median(scores)))
     assert 0 < strict.is_valid.sum() < default.is_valid.sum()
+    every = dict.fromkeys(detector.classes, float(np.median(scores)))
+    for given in (every, tuple(every.values()), f"{np.median(scores)}"):
+        _equal(detector(projections[:1], score_threshold=given), strict, atol=0)
+    cls = detector.classes[int(default.classes[0, 0])]
+    others = detector(projections[:1], score_threshold={cls: 1.0})  # 0.3 for the others
+    assert cls not in others.to_boxes().cls
+    assert others.is_valid.any()
     assert detector(projections[:1], nms_iou=1.0).is_valid.sum() >= scores.size
     region = detector(projections[:1], roi=(0, 15, -5, 5, -10, 10))
     boxes = np.asarray(region.boxes)[np.asarray(region.is_valid)]

@@ -50,7 +50,8 @@ for n in (1, 3):
     for key, value in detect(*args).items():
         found[f"{key}_{n}"] = np.asarray(value)
     if n == 3:
-        strict = detect(*args, score_threshold=0.5, roi=(0, 20, -5, 5, -9, 9))
+        thresholds = [0.5, 0.3, 0.9, 0.5, 0.2]  # by class
+        strict = detect(*args, score_threshold=thresholds, roi=(0, 20, -5, 5, -9, 9))
         found.update({f"{k}_strict": np.asarray(v) for k, v in strict.items()})
 np.savez(out, **found)
 """
@@ -110,7 +111,8 @@ def test_a_fresh_process_without_radejax_finds_the_same_boxes(tmp_path):
     _check(found, "1", detector(projection[:1]))
     _check(found, "3", detector(projection))
     region = (0, 20, -5, 5, -9, 9)
-    strict = detector(projection, score_threshold=0.5, roi=region)
+    thresholds = (0.5, 0.3, 0.9, 0.5, 0.2)
+    strict = detector(projection, score_threshold=thresholds, roi=region)
     assert 0 < strict.is_valid.sum() < detector(projection).is_valid.sum()
     _check(found, "strict", strict)
     config = json.loads((folder / "config.json").read_text())
@@ -187,7 +189,8 @@ def test_a_program_of_one_batch_size_and_platform_has_static_shapes(tmp_path):
     given = dict(
         exported_loader.read_weights((tmp_path / "model.safetensors").read_bytes())
     )
-    given |= dict(zip(names, (projection, 0.1, 0.3, (-99, 99) * 3), strict=True))
+    settings = [0.1] * len(detector.classes), 0.3, (-99, 99) * 3
+    given |= dict(zip(names, (projection, *settings), strict=True))
     inputs = [np.asarray(given[row["name"]], row["dtype"]) for row in rows]
     assert [list(x.shape) for x in inputs] == [row["shape"] for row in rows]
     found = _run_bytecode(tmp_path, inputs)
@@ -238,6 +241,8 @@ def test_a_program_that_begins_with_the_tensor(tmp_path):
     for name, value in (("score_threshold", np.nan), ("nms_iou", 1.5)):
         with pytest.raises(ValueError, match=f"{name} {value}: expected a number from"):
             detect(small.projections(1), **{name: value})
+    with pytest.raises(ValueError, match="expected one number, or 5, one per class"):
+        detect(small.projections(1), score_threshold=[0.5, 0.5])
     _, left_out = export.export(small.detector("camera"), tmp_path, kind="huggingface")
     assert left_out == ["params/image_backbone"]
     assert "DINOv3" in (tmp_path / "README.md").read_text()
@@ -452,7 +457,8 @@ def test_onnx_files_give_the_same_boxes(kind, tmp_path):
         assert len(kernels) > 5
         assert constants.issuperset(kernels)  # as the quantization needs it
 
-    for score, roi in ((0.1, (-99, 99) * 3), (0.5, (0, 20, -5, 5, -9, 9))):
+    by_class = [0.5, 0.3, 0.9, 0.5, 0.2]
+    for score, roi in (([0.1] * 5, (-99, 99) * 3), (by_class, (0, 20, -5, 5, -9, 9))):
         settings = {"score_threshold": score, "nms_iou": 0.3, "roi": roi}
         feed = {name: np.asarray(value, np.float32) for name, value in settings.items()}
         found = run("detector.onnx", inputs | feed)
@@ -478,7 +484,7 @@ def test_onnx_files_give_the_same_boxes(kind, tmp_path):
     assert "(opset 18, for ONNX Runtime 1.19 or newer)" in (
         tmp_path / "README.md"
     ).read_text(encoding="utf-8")
-    for name, value in (("score_threshold", 0.1), ("roi", (20, 0, -5, 5, -9, 9))):
+    for name, value in (("score_threshold", by_class), ("roi", (20, 0, -5, 5, -9, 9))):
         feed[name] = np.asarray(value, np.float32)  # as the page says, no error
     assert not run("detector.onnx", inputs | feed)["is_valid"].any()
     assert [row["name"] for row in rows] == [x.name for x in session.get_inputs()]

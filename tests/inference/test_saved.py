@@ -17,6 +17,7 @@ from radejax.config import Config
 from radejax.core.errors import DataError
 from radejax.inference import exported_loader
 from radejax.inference import saved as saved_models
+from radejax.inference.export import export
 from radejax.inference.saved import (
     WEIGHTS_FILE,
     load_model,
@@ -313,3 +314,43 @@ def test_whatever_is_wrong_in_the_config_is_named(tmp_path):
     save_model(wider, tmp_path)
     with pytest.raises(DataError, match=r"do not fit config\.model"):
         load_model(tmp_path)
+
+
+# Score thresholds and calibration of a run -------------------------------------------
+
+
+def _evaluation(workdir, name, step, chosen_on, thresholds):
+    chosen = [{"cls": "Sedan", "threshold": 0.9, "rule": "wanted_precision"}]
+    for cls, threshold in thresholds.items():
+        chosen.append({"cls": cls, "threshold": threshold, "rule": "best_f1"})
+    found = {"step": step, "thresholds": {"chosen_on": chosen_on, "chosen": chosen}}
+    (workdir / name).mkdir()
+    (workdir / name / "metrics.json").write_text(json.dumps(found))
+
+
+def test_the_thresholds_of_the_validation_split_are_exported(tmp_path, caplog):
+    run = tmp_path / "run"
+    run.mkdir()
+    model = dataclasses.replace(small.detector().saved, step=7, identity={"run": "a"})
+    _evaluation(run, "evaluation_a", 3, "the validation split", {"Sedan": 0.7})
+    _evaluation(run, "evaluation", 7, None, {})
+    with pytest.raises(
+        UserError, match="no evaluation of step 7 chose score thresholds"
+    ):
+        saved_models.with_chosen_thresholds(model, run, "best_f1")
+    _evaluation(
+        run, "evaluation_b", 7, "the evaluated frames themselves", {"Sedan": 0.6}
+    )
+    chosen = {"Pedestrian": 0.2, "Sedan": 0.4}
+    _evaluation(run, "evaluation_c", 7, "the validation split", chosen)
+    found = saved_models.with_chosen_thresholds(model, run, "best_f1")
+    # The other classes keep the threshold of the config.
+    assert found.config.decode.score_threshold == (0.4, 0.1, 0.2, 0.1, 0.1)
+    assert "Bus or Truck, Motorcycle, Bicycle: no threshold" in caplog.text
+    export(Detector(found), tmp_path / "out", kind="huggingface")
+    again = load_model(tmp_path / "out")
+    assert again.config.decode.score_threshold == (0.4, 0.1, 0.2, 0.1, 0.1)
+    assert again.identity["thresholds"]["evaluation"] == "evaluation_c"
+    card = (tmp_path / "out" / "README.md").read_text()
+    assert "| score threshold Pedestrian | 0.2 |" in card
+    assert "| thresholds chosen on | the validation split |" in card
