@@ -29,7 +29,6 @@ from radejax.core.options import (
     Options,
     Seed,
     as_tuples,
-    class_thresholds,
     did_you_mean,
     find_function,
 )
@@ -101,8 +100,10 @@ class Config(Options):
         classes = f"{len(self.classes)}, the number of config.classes"
         is_equal = count == len(self.classes)
         require(is_equal, "config.model.num_classes", count, classes)
-        least, name = self.decode.score_threshold, "config.decode.score_threshold"
-        class_thresholds(least, self.classes, least, name)
+        for field in ("score_threshold", "calibration"):
+            value = getattr(self.decode, field)
+            is_fine = not isinstance(value, tuple) or len(value) == count
+            require(is_fine, f"config.decode.{field}", value, f"{count}, one per class")
         if self.train.evaluate_every_epochs:
             ious = self.evaluation.iou_thresholds
             known = [

@@ -19,6 +19,7 @@ from radejax.config import (
     with_texts,
 )
 from radejax.core.errors import UserError
+from radejax.detection.decode import DecodeOptions
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.options import DinoRadeOptions
 from radejax.simulation.config import SimulationOptions
@@ -318,3 +319,14 @@ def test_axes_replace_the_arguments_of_a_reduced_grid() -> None:
     assert options.replace(grid={"num_range": 32}).make_grid().num_range == 32
     with pytest.raises(UserError, match=r"^config\.simulation\.grid\.num_"):
         options.replace(grid={"num_rang": 32})
+
+
+def test_every_class_may_have_its_threshold_and_calibration() -> None:
+    texts = {"decode.score_threshold": "0.1,0.2,0.3,0.4,0.5"}
+    found = with_texts(Config(), texts).decode.score_threshold
+    assert found == (0.1, 0.2, 0.3, 0.4, 0.5)
+    pairs = ((0.5, -1.0), (1.0, 0.0))
+    for name, value in (("score_threshold", (0.1, 0.2)), ("calibration", pairs)):
+        expected = f"config.decode.{name} is {value}, expected 5, one per class"
+        with pytest.raises(UserError, match=re.escape(expected)):
+            Config(decode=DecodeOptions(**{name: value}))

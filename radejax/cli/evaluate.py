@@ -157,6 +157,33 @@ def evaluate(
 
 
 @click.command(cls=entry.Command)
+@click.argument("run_folder", metavar="RUN", type=entry.EXISTING)
+@entry.step
+@click.option("--split", default="validation", help="validation, or a split file.")
+@several("--data", help="Roots of other labelled sequences. Default: those of the run.")
+@entry.image_backbone
+@entry.json_option
+def calibrate(run_folder: str, as_json: bool, **options: object) -> None:
+    """Fit probabilities to the scores of a run on sequences it was not trained on.
+
+    `Detector`, `radejax detect` and exported programs then give the probability of every
+    box. Scores and APs do not change. Without a validation split (config.data.validation),
+    give other labelled sequences.
+
+    Example: radejax calibrate runs/quickstart
+    """
+    from radejax.runs.evaluate import calibrate_run
+
+    given = _given(options)
+    other = {"roots": given.pop("data")} if "data" in given else None
+    entry.set_up_jax()
+    content = calibrate_run(run_folder, other=other, **given)
+    classes = content["classes"].items()
+    rows = [f"{cls}: temperature {t:.3g}, offset {x:.3g}" for cls, (t, x) in classes]
+    entry.echo_result(as_json, content, "\n".join(rows))
+
+
+@click.command(cls=entry.Command)
 @click.argument("predictions", type=entry.EXISTING)
 @click.option(
     "--out",

@@ -7,7 +7,7 @@ import click
 from radejax.cli import entry
 from radejax.cli.data import data, embed, points, preprocess, reduce, simulate
 from radejax.cli.detect import detect, export
-from radejax.cli.evaluate import compare, evaluate, runs, score
+from radejax.cli.evaluate import calibrate, compare, evaluate, runs, score
 from radejax.cli.figures import demo, overlay, view
 from radejax.cli.train import train
 from radejax.core.version import __version__
@@ -23,6 +23,7 @@ _COMMANDS = (
     view,
     train,
     evaluate,
+    calibrate,
     score,
     compare,
     runs,

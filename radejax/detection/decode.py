@@ -18,7 +18,13 @@ from flax import struct
 from jaxtyping import Bool, Float, Int, Num, Real, Shaped
 
 from radejax.core.errors import require
-from radejax.core.options import AtLeastOne, Fraction, Options, ScoreThreshold
+from radejax.core.options import (
+    AtLeastOne,
+    Fraction,
+    Options,
+    Positive,
+    ScoreThreshold,
+)
 from radejax.core.structures import MIN_SIZE_M, Array, DetectionMaps, Detections
 from radejax.detection.nms import rotated_nms
 from radejax.geometry.boxes import boxes7_from_8
@@ -49,6 +55,9 @@ class DecodeOptions(Options, section="config.decode"):
     raw_yaw: RawYaw = "nms"
     """Where the length of the regressed (sin, cos) vector scales length and width: nms (in
     NMS only), always (in the results too, as in the released evaluator), never."""
+    calibration: tuple[tuple[Positive, float], ...] | None = None
+    """Temperature and offset per class, by which scores become probabilities (see
+    `scores.fit_calibration`); None: no probabilities. `radejax calibrate` fits them."""
     clip_sizes: bool = True
     """Clip sizes to at least 0.01 m; in the released code, they may be negative."""
 
@@ -129,7 +138,8 @@ def decode(
     Returns:
         Detections by descending score; those with equal scores are ordered by range bin,
         then azimuth bin. `num_truncated` counts peaks beyond `pre_nms` and boxes beyond K
-        after NMS.
+        after NMS. With `options.calibration`, `outputs` has the "probability" that each
+        detection matches an object.
 
     Raises:
         ValueError: The shapes of maps and grid differ, no peak may enter NMS, or `roi` does
@@ -168,7 +178,16 @@ def decode(
         length = jnp.linalg.norm(boxes[..., 6:8], axis=-1, keepdims=True)
         boxes = boxes.at[..., 3:5].multiply(length).at[..., 3:6].max(least_m)
         peaks = dataclasses.replace(peaks, boxes=boxes)
-    return _compact(peaks, keep, options.max_detections)
+    found = _compact(peaks, keep, options.max_detections)
+    if options.calibration is None:
+        return found
+    temperature, offset = jnp.array(options.calibration, jnp.float32).T
+    # Padding has class -1 and score 0, whose probability is 0.
+    logits = jnp.log(found.scores) - jnp.log1p(-found.scores)
+    probability = jax.nn.sigmoid(
+        logits / temperature[found.classes] + offset[found.classes]
+    )
+    return found.replace(outputs=found.outputs | {"probability": probability})
 
 
 def suppress(

@@ -66,12 +66,14 @@ class Report:
         metrics: Content of metrics.json.
         results: All average precisions.
         folder: Folder of the written files.
+        data: Matched predictions and objects.
     """
 
     text: str
     metrics: JsonObject
     results: list[Result]
     folder: pathlib.Path
+    data: EvaluationSet
 
 
 def write_report(
@@ -190,7 +192,7 @@ def write_report(
                 save_figure(figure, folder / f"{name}.{options.figures}", origin)
         scenes = () if draw_scenes is None else draw_scenes(data, folder)
         write_html(folder / "report.html", metrics, built, curves, scenes)
-    return Report(text, metrics, results, pathlib.Path(out_dir))
+    return Report(text, metrics, results, pathlib.Path(out_dir), data)
 
 
 def _all_tables(metrics: JsonObject, tables: RunTables) -> list[Table]:

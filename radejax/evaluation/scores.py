@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import minimize
 from scipy.special import expit, logit
 
+from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import EPSILON, Curve
 
 RULES = ("best_f1", "wanted_precision")
@@ -107,6 +108,25 @@ def reliability(
     count, *sums = (np.bincount(bins, column) for column in columns)
     has = count > 0
     return Reliability(count[has], *(x[has] / count[has] for x in sums))
+
+
+def fit_calibrations(data: EvaluationSet, iou: float) -> dict[str, tuple[float, float]]:
+    """Fits temperature and offset of every class, see `fit_calibration`.
+
+    Args:
+        data: Predictions and objects, which match in 3D as in `all_point`.
+        iou: IoU threshold of a match.
+
+    Examples:
+        >>> car = {"frame": [0], "box": [[20.0, 0, 0, 4, 2, 1.5, 0]], "cls": ["Sedan"]}
+        >>> data = EvaluationSet(car, {**car, "score": [0.9]}, classes=["Sedan"])
+        >>> list(fit_calibrations(data, 0.5))
+        ['Sedan']
+    """
+    is_matched = data.matched_objects("plain", "free", "3d", iou) >= 0
+    rows = [data.pred.cls == cls for cls in range(len(data.classes))]
+    fits = [fit_calibration(data.score[x], is_matched[x]) for x in rows]
+    return dict(zip(data.classes, fits, strict=True))
 
 
 def fit_calibration(

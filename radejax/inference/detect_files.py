@@ -335,9 +335,14 @@ def detect_files(
             Boxes.concatenate(found or [Boxes.one_frame([], [], [])]),
             keys,
         )
-    if file_format == "kitti" and detector.saved.config.model.outputs:
-        own = ", ".join(detector.saved.config.model.outputs)
-        _log.warning("the format kitti has no columns for %s: not written", own)
+    config = detector.saved.config
+    own = [
+        *config.model.outputs,
+        *(["probability"] if config.decode.calibration else []),
+    ]
+    if file_format == "kitti" and own:
+        text = "the format kitti has no columns for %s: not written"
+        _log.warning(text, ", ".join(own))
     if detector.num_frames > 1:
         count["repeated"] = len(dataclasses.replace(inputs, keys=seen).parts(2))
     if detector.takes_camera:

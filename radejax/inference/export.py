@@ -334,6 +334,7 @@ _UNITS = {
     "classes": "index into config.classes, -1 for padding",
     "is_valid": "true for a detection",
     "num_truncated": "number of peaks and boxes that were dropped",
+    "probability": "0 to 1",
     "num_invalid": "number of frames that cannot be radar data",
 }
 

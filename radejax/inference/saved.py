@@ -52,6 +52,7 @@ _log = logging.getLogger(__name__)
 
 CONFIG_FILE = "config.json"
 WEIGHTS_FILE = "model.safetensors"
+CALIBRATION_FILE = "calibration.json"
 
 FROZEN_BACKBONE = "sha256 of the frozen image backbone"
 """Key of the first 16 digits of the checksum in a checkpoint's description of its run."""
@@ -352,7 +353,7 @@ def _read_checkpoint(path: pathlib.Path, step: Step) -> SavedModel:
         ) from None
     config.check_parts(info["run"].get("parts", {}), folder.parent)
     return SavedModel(
-        config,
+        _with_calibration(config, folder.parent, number),
         RadarGrid.from_dict(info["grid"]),
         {"params": params, **(state.get("model_state") or {})},
         number,
@@ -360,6 +361,20 @@ def _read_checkpoint(path: pathlib.Path, step: Step) -> SavedModel:
         info["run"].get("input"),
         _identity(folder.parent, number, info["run"]),
     )
+
+
+def _with_calibration(config: Config, workdir: pathlib.Path, step: int) -> Config:
+    """Return a config with the calibration of the run if it is that of the step."""
+    path = workdir / CALIBRATION_FILE
+    if not path.exists():
+        return config
+    found = files.read_object(path, "step", "classes")
+    if found["step"] != step:
+        text = "%s is of step %s, not %s, and not used: run `radejax calibrate` again"
+        _log.warning(text, path, found["step"], step)
+        return config
+    pairs = [found["classes"][cls] for cls in config.classes]
+    return config.replace(decode={"calibration": pairs})
 
 
 def _identity(workdir: pathlib.Path, step: int, run: JsonObject) -> JsonObject:
@@ -412,7 +427,7 @@ def with_chosen_thresholds(
     """
     reports = _evaluations(files.as_path(workdir), saved.step)
     found = {name: x["thresholds"] for name, x in reports if "thresholds" in x}
-    chosen = [name for name, x in found.items() if x["chosen_on"]]
+    chosen = [name for name, x in found.items() if x["chosen"]]
     chosen.sort(key=lambda name: found[name]["chosen_on"] != "the validation split")
     if not chosen:
         raise UserError(
@@ -426,9 +441,9 @@ def with_chosen_thresholds(
     config = saved.config
     usual = config.decode.score_threshold
     least = class_thresholds(by_class, config.classes, usual)
-    origin = {"rule": rule, "evaluation": chosen[0]}
-    origin["chosen on"] = thresholds["chosen_on"]
-    _log.info("score thresholds of %s", origin)
+    chosen_on = thresholds["chosen_on"]
+    origin = {"rule": rule, "evaluation": chosen[0], "chosen on": chosen_on}
+    _log.info("score thresholds %s of %s", by_class, origin)
     if kept := [cls for cls in config.classes if cls not in by_class]:
         _log.warning("%s: no threshold, that of the config is kept", ", ".join(kept))
     config = config.replace(decode={"score_threshold": least})

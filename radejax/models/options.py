@@ -26,7 +26,7 @@ OutOfViewRule = Literal["drop", "official"]
 Bins = Annotated[int, Ge(0), Le(1 << 16)]
 Axis = Annotated[tuple[float, ...], MinLen(2)]
 
-_TAKEN = {"heatmap", "box", "frame", "cls", "score", *BOX_FIELDS}
+_TAKEN = {"heatmap", "box", "frame", "cls", "score", "probability", *BOX_FIELDS}
 """Names of heads, and columns of boxes."""
 
 MARGIN_PX = 280

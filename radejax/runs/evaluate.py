@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 from radejax import models
 from radejax.config import Config
 from radejax.core import devices, files
-from radejax.core.errors import UserError
+from radejax.core.errors import UserError, require
 from radejax.core.files import JsonObject, PathLike
 from radejax.core.structures import Batch, Boxes, DetectionMaps
 from radejax.data.cameras import require_images
@@ -49,10 +49,11 @@ from radejax.evaluation.results import (
     make_set,
     name_of_changes,
 )
+from radejax.evaluation.scores import fit_calibrations
 from radejax.inference.detector import Detector
 from radejax.inference.inputs import check_backbone
 from radejax.inference.predict import predict_dataset
-from radejax.inference.saved import SavedModel, Step, load_model
+from radejax.inference.saved import CALIBRATION_FILE, SavedModel, Step, load_model
 from radejax.losses.detection import detection_loss
 from radejax.runs import figures
 from radejax.runs.data import Data, data_name, data_of_run
@@ -506,6 +507,42 @@ def evaluate_run(
     return evaluation.report(
         saved.variables, workdir, out=place, step=saved.step, run=run, choosing=others
     )
+
+
+def calibrate_run(workdir: PathLike, **options: Any) -> JsonObject:
+    """Fit probabilities to the scores of a run, and write `calibration.json` to its workdir.
+
+    Models that are loaded from the workdir then predict them, see `DecodeOptions`. The
+    predictions are evaluated too, in a folder of their own.
+
+    Args:
+        workdir: Workdir of the run.
+        **options: Further arguments of `evaluate_run`, such as the split, by default
+            "validation".
+
+    Returns:
+        The content of the file: the step, the frames, and temperature and offset by class.
+
+    Raises:
+        UserError: There is no validation split, a class has no predictions, or
+            `evaluate_run` raises it.
+    """
+    report = evaluate_run(workdir, **{"split": "validation", **options})
+    assert report is not None  # because this is the only process
+    iou = report.metrics["options"]["iou_thresholds"][0]
+    data = report.data
+    count = np.bincount(data.pred.cls, minlength=len(data.classes))
+    by_class = dict(zip(data.classes, count.tolist(), strict=True))
+    expected = "some of every class: give more sequences by --split or --data"
+    require(all(count), f"{report.folder}: predictions to fit", by_class, expected)
+    content: JsonObject = {
+        "step": report.metrics["step"],
+        "evaluation": report.folder.name,
+        "iou": iou,
+        "classes": fit_calibrations(data, iou),
+    }
+    files.write_json(files.as_path(workdir) / CALIBRATION_FILE, content)
+    return content
 
 
 def source_of(data: Data, split: str, shuffle_images: int | None = None) -> JsonObject:

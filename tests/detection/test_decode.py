@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from radejax.config import load_config
 from radejax.core.structures import WIDE_ROI, DetectionMaps
 from radejax.detection import decode as D
+from radejax.evaluation.scores import calibrated
 from radejax.geometry.boxes import boxes7_from_8
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -184,6 +185,26 @@ def test_every_class_has_its_threshold():
         for threshold in (np.full(C, 0.4, np.float32), 0.4)
     )
     jax.tree.map(np.testing.assert_array_equal, same, one)
+
+
+def test_probabilities_are_a_further_output():
+    logits, params, *_ = scattered(4)
+    maps = DetectionMaps(jnp.asarray(logits), jnp.asarray(params))
+    fits = ((0.5, -1.0), (2.0, 0.5), (1.0, 0.0))
+    plain, found = decode(maps, GRID), decode(maps, GRID, calibration=fits)
+    probability = found.outputs["probability"]
+    for name in ("boxes", "scores", "classes", "is_valid", "num_truncated"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(plain, name))
+    rows = plain.is_valid
+    assert rows.sum() == 4
+    assert not probability[~rows].any()
+    for cls, fit in enumerate(fits):
+        mine = rows & (plain.classes == cls)
+        expected = calibrated(plain.scores[mine], *fit)
+        np.testing.assert_allclose(probability[mine], expected, rtol=1e-5)
+    sure = DetectionMaps(jnp.asarray(logits).at[0, 4, 0, 0].set(99), maps.box_params)
+    certain = decode(sure, GRID, calibration=fits)
+    assert (certain.scores[0, 0], certain.outputs["probability"][0, 0]) == (1, 1)
 
 
 def scattered(num=6, spacing=3, seed=0):

@@ -92,10 +92,15 @@ def _check(found, suffix, expected):
     assert is_valid.any()
     np.testing.assert_array_equal(found[f"is_valid_{suffix}"], is_valid)
     np.testing.assert_array_equal(found[f"classes_{suffix}"], expected.classes)
-    for name in ("scores", "boxes"):
-        np.testing.assert_allclose(
-            found[f"{name}_{suffix}"], getattr(expected, name), atol=1e-4, rtol=1e-4
-        )
+    floats = {"scores": expected.scores, "boxes": expected.boxes} | expected.outputs
+    for name, x in floats.items():
+        np.testing.assert_allclose(found[f"{name}_{suffix}"], x, atol=1e-4, rtol=1e-4)
+
+
+def _calibrated(detector):
+    """The detector with probabilities as a further output."""
+    config = detector.saved.config.replace(decode={"calibration": [(0.4, -0.5)] * 5})
+    return Detector(dataclasses.replace(detector.saved, config=config))
 
 
 @pytest.mark.slow
@@ -172,7 +177,7 @@ def test_own_outputs_are_results_of_an_onnx_file(tmp_path):
 
 
 def test_a_program_of_one_batch_size_and_platform_has_static_shapes(tmp_path):
-    detector = small.detector()
+    detector = _calibrated(small.detector())
     export.export(detector, tmp_path, platforms=("cpu",), batch_size=2)
     exported = jax.export.deserialize((tmp_path / "detector.stablehlo").read_bytes())
     assert exported.in_avals[-4].shape == (2, *detector.grid.projection_shape)
@@ -195,7 +200,8 @@ def test_a_program_of_one_batch_size_and_platform_has_static_shapes(tmp_path):
     assert [list(x.shape) for x in inputs] == [row["shape"] for row in rows]
     found = _run_bytecode(tmp_path, inputs)
     wanted = detector(projection, roi=(-99, 99) * 3)
-    expected = vars(wanted) | {"num_invalid": np.zeros(2)}
+    expected = vars(wanted) | wanted.outputs | {"num_invalid": np.zeros(2)}
+    assert (wanted.outputs["probability"] > wanted.scores).any()
     rows = json.loads((tmp_path / "outputs.json").read_text())
     for row, value in zip(rows, found, strict=True):
         np.testing.assert_allclose(value, expected[row["name"]], atol=1e-4)
@@ -431,7 +437,7 @@ def test_onnx_files_give_the_same_boxes(kind, tmp_path):
     pytest.importorskip("jax2onnx")
     runtime = pytest.importorskip("onnxruntime")
     onnx = pytest.importorskip("onnx")
-    detector, count = small.detector(kind), 2
+    detector, count = _calibrated(small.detector(kind)), 2
     arguments: tuple[Any, ...] = (small.projections(count),)
     inputs = {"projection": arguments[0]}
     if kind == "camera":

@@ -321,6 +321,7 @@ def test_whatever_is_wrong_in_the_config_is_named(tmp_path):
 
 def _evaluation(workdir, name, step, chosen_on, thresholds):
     chosen = [{"cls": "Sedan", "threshold": 0.9, "rule": "wanted_precision"}]
+    chosen = chosen if thresholds else []
     for cls, threshold in thresholds.items():
         chosen.append({"cls": cls, "threshold": threshold, "rule": "best_f1"})
     found = {"step": step, "thresholds": {"chosen_on": chosen_on, "chosen": chosen}}

@@ -1,6 +1,7 @@
 """What is done to the frames of a run before it is evaluated."""
 
 import dataclasses
+import json
 import pathlib
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -16,6 +17,7 @@ from radejax.core.errors import UserError
 from radejax.core.structures import DetectionMaps
 from radejax.data.kradar import Frame
 from radejax.detection.decode import DecodeOptions, decode
+from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.runs import evaluate
 from radejax.runs.evaluate import report_options
@@ -162,3 +164,30 @@ def test_folder_and_remark_follow_the_options(
     assert written["run"] == name
     assert written["compared"] == ("mean", options.get("split", "test"))
     assert ("may not be reported" in caplog.text) == bool(remark)
+
+
+def test_calibration_of_a_run_is_stored_with_it(
+    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    box = np.tile([20.0, 0, 0, 4, 2, 1.5, 0], (2, 1))
+    truth = {"frame": np.arange(2), "box": box, "cls": np.array(["Sedan", "Bicycle"])}
+    given: dict[str, Any] = {}
+
+    def evaluate_run(workdir: pathlib.Path, **options: Any) -> Any:
+        given.update(options)
+        found = {**truth, "score": np.array([0.9, 0.4])}
+        data = EvaluationSet(truth, found, classes=given["classes"])
+        metrics = {"step": 7, "options": {"iou_thresholds": [0.3, 0.5]}}
+        return SimpleNamespace(data=data, metrics=metrics, folder=tmp_path / "report")
+
+    monkeypatch.setattr(evaluate, "evaluate_run", evaluate_run)
+    found = evaluate.calibrate_run(tmp_path, classes=("Bicycle", "Sedan"))
+    assert given["split"] == "validation"
+    stored = json.loads((tmp_path / "calibration.json").read_text())
+    assert (stored["step"], stored["evaluation"], stored["iou"]) == (7, "report", 0.3)
+    assert {n: tuple(x) for n, x in stored["classes"].items()} == found["classes"]
+    with pytest.raises(
+        UserError, match=r"report: predictions to fit is .*rian': 0}, exp"
+    ):
+        evaluate.calibrate_run(tmp_path, classes=("Sedan", "Pedestrian"), split="all")
+    assert given["split"] == "all"

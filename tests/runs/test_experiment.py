@@ -21,6 +21,7 @@ from radejax.core.version import __version__, radejax_commit
 from radejax.data.kradar import dataset
 from radejax.inference.detect_files import detect_files, find_inputs
 from radejax.inference.detector import Detector
+from radejax.inference.saved import load_model
 from radejax.runs import evaluate, experiment
 from radejax.runs.experiment import claimed
 from radejax.simulation.config import SimulationOptions
@@ -153,6 +154,15 @@ def test_a_run_of_two_frames(
     assert origin["data"]["license"] == "Apache-2.0, that of radejax"
     assert origin["metrics"]["split"] == "test"
     assert all("/all/" in name for name in origin["metrics"]["ap"])
+    metrics = json.loads((folder / "evaluation" / "metrics.json").read_text())
+    assert metrics["thresholds"]["chosen_on"] == "the validation split"
+    fits = {cls: [0.5, 1.0] for cls in config.classes}
+    for step, expected in ((99, None), (origin["step"], ((0.5, 1.0),) * 5)):
+        content = json.dumps({"step": step, "classes": fits})
+        (folder / "calibration.json").write_text(content)
+        assert load_model(folder).config.decode.calibration == expected
+    assert "calibration.json is of step 99, not" in caplog.text
+    (folder / "calibration.json").unlink()
     report = (folder / "evaluation" / "report.txt").read_text()
     told = (
         f"step {origin['step']}, data data, split test, radejax {__version__}, commit "

@@ -107,6 +107,13 @@ def test_the_legend_is_true_of_the_boxes_that_are_drawn(score, expected):
     assert last.get_text().endswith(expected)
 
 
+def test_legend_has_the_range_of_thresholds_of_classes():
+    found = Boxes.one_frame([20.0, -3.0, 0, 4, 2, 1.5, 0], ["Sedan"], [0.875])
+    thresholds = (0.4, 0.2, 0.3)
+    ax = draw.draw_bev(scene(predictions=found, score_threshold=thresholds))
+    assert ax.get_legend().get_texts()[-1].get_text() == "score ≥ 0.2 to 0.4"
+
+
 def test_outcomes_have_their_own_colors_and_labels_do_not_overlap():
     x_m = np.array([10.0, 16.0, 22.0, 30.0])
     box = np.tile([0.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0], (4, 1))
