@@ -1,9 +1,13 @@
-"""Examples in docstrings run, and every public function of the pure packages has one."""
+"""Docstrings have one grammatical form, and their examples run.
+
+Every public function of the pure packages has an example.
+"""
 
 import ast
 import doctest
 import importlib
 import pathlib
+import re
 from collections.abc import Iterator
 
 import pytest
@@ -62,3 +66,17 @@ def test_every_public_function_of_the_pure_packages_has_an_example() -> None:
         and name not in EXAMPLES
     ]
     assert not lacking
+
+
+def test_functions_are_described_in_the_third_person() -> None:
+    """Properties have noun phrases, and commands the imperative of help texts."""
+    other = re.compile(r"property|(^|\.)(command|group)\(")
+    wrong = [
+        f"{name}: {text.splitlines()[0]}"
+        for name, (_, node) in NODES.items()
+        if isinstance(node, ast.FunctionDef)
+        and not any(other.search(ast.unparse(x)) for x in node.decorator_list)
+        and (text := ast.get_docstring(node))
+        and not re.match(r"[A-Z][a-z]*[^s]s\b", text)
+    ]
+    assert not wrong

@@ -10,7 +10,7 @@ _MAX_BYTES = 4 * 2**30
 
 
 def enable_compilation_cache() -> None:
-    """Let JAX store compiled programs on the disk, so that later starts need not compile.
+    """Lets JAX store compiled programs on the disk, so that later starts need not compile.
 
     The commands call this function. Scripts and notebooks call it once, before they use
     JAX.

@@ -612,7 +612,7 @@ class PublishedRow:
         return ", ".join(known)
 
     def is_comparable(self, options: ReportOptions, split: str | None) -> bool:
-        """Whether protocol, score threshold, labels, region and split are the same."""
+        """Returns True if protocol, score threshold, labels, region and split are equal."""
         return (
             options.paper_protocol == self.protocol
             and options.settings_of(self.protocol)["score_threshold"]

@@ -54,7 +54,7 @@ def front_images(
     camera_calibration: PathLike | None = None,
     roots: Sequence[PathLike] = (),
 ) -> dict[pathlib.Path, View]:
-    """Find the images and cameras of frames.
+    """Finds the images and cameras of frames.
 
     Args:
         paths: Radar files that `find_frames` returned.
@@ -102,7 +102,7 @@ def front_images(
 
 
 def _views(frames: FrameSequence, detector: Detector) -> list[View]:
-    """Return image file and camera of every frame, `NO_VIEW` unless it has both.
+    """Returns image file and camera of every frame, `NO_VIEW` unless it has both.
 
     The list is empty for a radar-only model.
 
@@ -140,7 +140,7 @@ class FrameInputs:
     views: Sequence[View]
 
     def parts(self, num_frames: int) -> list[range]:
-        """Return the positions of every part of consecutive frames.
+        """Returns the positions of every part of consecutive frames.
 
         Every frame is a part if a sample has one frame.
         """
@@ -149,7 +149,7 @@ class FrameInputs:
         return [range(*ends) for ends in itertools.pairwise([*starts, len(self.keys)])]
 
     def read(self, index: int, reader: InputReader) -> _Inputs:
-        """Read the radar data and the image of a frame, and return its camera too.
+        """Reads the radar data and the image of a frame, and returns its camera too.
 
         Raises:
             DataError: A file is corrupted.
@@ -162,7 +162,7 @@ class FrameInputs:
         return reader.read_radar([self.radar(index)])[0], image, camera
 
     def state(self, index: int) -> State:
-        """Return the state of the files of a frame, and a checksum of its camera."""
+        """Returns the state of the files of a frame, and a checksum of its camera."""
         image, camera = self.views[index]
         checksum = zlib.crc32(repr(camera).encode())
         return [*state_of([self.paths[index], image]), ["camera", checksum]]
@@ -177,7 +177,7 @@ def find_inputs(
     labels: PathLike | None = None,
     camera_calibration: PathLike | None = None,
 ) -> FrameInputs:
-    """Find the frames in files and folders by the reader of the detector's run.
+    """Finds the frames in files and folders by the reader of the detector's run.
 
     Args:
         detector: Detector of the frames.
@@ -230,7 +230,7 @@ def _of_files(
     labels: PathLike | None,
     camera_calibration: PathLike | None,
 ) -> FrameInputs:
-    """Return K-Radar's files as inputs, with their images for a radar-camera model."""
+    """Returns K-Radar's files as inputs, with their images for a radar-camera model."""
     seen: dict[str, pathlib.Path] = {}
     for path in found:
         if (other := seen.setdefault(key_of(path), path)) is not path:
@@ -256,7 +256,7 @@ def detect_files(
     batch_size: int = 8,
     file_format: str = "json",
 ) -> tuple[dict[str, int], dict[str, str]]:
-    """Detect the objects in every frame, and write one file per frame atomically.
+    """Detects the objects in every frame, and writes one file per frame atomically.
 
     A second call with the same model, settings and frames continues an interrupted one: it
     detects in the frames without a file and in those whose radar file or image changed, or
@@ -353,7 +353,7 @@ def detect_files(
 def _claim(
     detector: Detector, keys: list[str], out: pathlib.Path, kind: str
 ) -> tuple[list[str], Manifest]:
-    """Describe the boxes in their folder, or open that of the same detection.
+    """Describes the boxes in their folder, or opens that of the same detection.
 
     Returns:
         The file of every frame, and the description.
@@ -385,7 +385,7 @@ def _batches(
     failed: dict[int, str],
     queue: list[Iterator[int]],
 ) -> Batches:
-    """Read the frames of a part as batches of `detect_batches`.
+    """Reads the frames of a part as batches of `detect_batches`.
 
     Frames that cannot be read go to `failed`. For a model of several frames, the rest of
     the part goes to the end of `queue` as a part of its own, as its first frame has no
@@ -416,7 +416,7 @@ def _batches(
 def _single(
     results: Iterable[tuple[Int[np.ndarray, " B"], Detections]],
 ) -> Iterator[tuple[int, Detections]]:
-    """Yield index and detections of every frame on the host."""
+    """Yields index and detections of every frame on the host."""
     for frames, detections in results:
         on_host = jax.device_get(detections)
         for row, frame in enumerate(frames.tolist()):
@@ -424,7 +424,7 @@ def _single(
 
 
 def _write_csv(path: pathlib.Path, boxes: Boxes, keys: Sequence[str]) -> None:
-    """Write all boxes as one table with the keys of their frames."""
+    """Writes all boxes as one table with the keys of their frames."""
     with files.atomic_path(path) as temporary, open(temporary, "w") as file:
         # A column with several values per box becomes several columns.
         columns = {

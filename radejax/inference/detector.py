@@ -59,7 +59,7 @@ def detect(
     camera: PyTree[Array] | None = None,
     settings: Settings | None = None,
 ) -> Detections:
-    """Compute detections from a batch of radar tensors.
+    """Computes detections from a batch of radar tensors.
 
     This is a pure function that can be jitted.
 
@@ -184,7 +184,7 @@ class Detector:
         image_backbone: PathLike | None = None,
         **options: Any,
     ) -> Detector:
-        """Create a detector from a training run or another model that `load_model` takes.
+        """Creates a detector from a training run or another model that `load_model` takes.
 
         Args:
             path: Workdir of `train.py`, its `checkpoints` or one of them, a folder of
@@ -211,7 +211,7 @@ class Detector:
         image_backbone: PathLike | None = None,
         **options: Any,
     ) -> Detector:
-        """Create a detector from an official RADE-Net or DinoRADE checkpoint.
+        """Creates a detector from an official RADE-Net or DinoRADE checkpoint.
 
         Args:
             path_or_state_dict: File, or mapping of names to arrays, see `load_torch`.
@@ -232,7 +232,7 @@ class Detector:
         variables: VariableDict | None = None,
         batch_sizes: Sequence[int] | None = None,
     ) -> Detector:
-        """Return a copy with other variables or batch sizes that shares compiled programs.
+        """Returns a copy with other variables or batch sizes that shares compiled programs.
 
         The counters of the copy start at zero.
 
@@ -250,7 +250,7 @@ class Detector:
         return other
 
     def _set_batch_sizes(self, sizes: Sequence[int]) -> None:
-        """Set the batch sizes, rounded up to multiples of the devices of this process."""
+        """Sets the batch sizes, rounded up to multiples of the devices of this process."""
         is_possible = len(sizes) > 0 and min(sizes, default=0) >= 1
         require(is_possible, "batch_sizes", sizes, "integers of at least 1")
         count = len(self.sharding.addressable_devices)
@@ -268,7 +268,7 @@ class Detector:
         nms_iou: float | None = None,
         roi: Sequence[float] | str | None = None,
     ) -> Detections:
-        """Detect the objects in one or more frames.
+        """Detects the objects in one or more frames.
 
         Args:
             frames: Projections `[B, R, A, D+E]` or tesseracts `[B, D, R, E, A]` in linear
@@ -321,7 +321,7 @@ class Detector:
         return found
 
     def _read_radar(self, frames: Frames, num_frames: int = 1) -> Real[Any, "B ..."]:
-        """Read radar data, and compare a frame of the first calls with the training's."""
+        """Reads radar data, and compares a frame of the first calls with the training's."""
         radar = self.reader.read_radar(frames, num_frames)
         if self._num_unchecked and isinstance(radar, np.ndarray):
             if radar.ndim == 5:  # on the host, as compiling takes longer
@@ -335,7 +335,7 @@ class Detector:
     def _detect(
         self, inputs: Inputs, settings: Settings, is_checked: bool
     ) -> Detections:
-        """Detect objects in at most as many frames as the largest batch size."""
+        """Detects objects in at most as many frames as the largest batch size."""
         count = len(inputs.radar)
         size = next(size for size in self._batch_sizes if size >= count)
         inputs = jax.tree.map(lambda x: self.put(_padded(x, size)), inputs)
@@ -358,7 +358,7 @@ class Detector:
         return found
 
     def _count_invalid(self, problems: Problems, count: int) -> None:
-        """Count invalid frames among the first `count`, and warn of the first ones."""
+        """Counts invalid frames among the first `count`, and warns of the first ones."""
         found = np.array(jax.device_get(problems))[:, :count]  # [problem, frame]
         num_invalid = int(found.any(axis=0).sum())
         if num_invalid and not self.num_invalid_frames:
@@ -379,7 +379,7 @@ class Detector:
     def _projections(
         self, radar: Real[Array, "B ..."]
     ) -> Float[np.ndarray, "B R A DE"]:
-        """Compute float32 projections of any radar data, and count invalid NumPy arrays."""
+        """Computes float32 projections of any radar data, and counts invalid NumPy arrays."""
         placed = jnp.asarray(radar)
         if isinstance(radar, np.ndarray):
             self._count_invalid(self._problems(placed), len(placed))
@@ -388,7 +388,7 @@ class Detector:
         return np.asarray(to_float(placed))
 
     def _stacked(self, radar: Real[Array, "BT ..."]) -> Float[np.ndarray, "B R A C"]:
-        """Compute the network input of samples, whose frames follow each other."""
+        """Computes the network input of samples, whose frames follow each other."""
         shape = (-1, self.num_frames, *self.grid.projection_shape)
         samples = np.moveaxis(self._projections(radar).reshape(shape), 1, 0)
         return stack_frames(list(samples), self.grid.num_doppler)
@@ -396,7 +396,7 @@ class Detector:
     def _samples(
         self, frames: Frames, history: Float[np.ndarray, "T1 R A DE"] | None
     ) -> tuple[Float[jax.Array, "B T R A DE"], Float[np.ndarray, "T1 R A DE"]]:
-        """Return the samples of consecutive frames, and the preceding ones of the next.
+        """Returns the samples of consecutive frames, and the preceding ones of the next.
 
         Args:
             frames: Single frames as arrays or paths.
@@ -412,7 +412,7 @@ class Detector:
         return jnp.asarray(known[rows]), known[-past:]
 
     def stream(self, frames: Iterable[Item], **settings: Any) -> Iterator[Detections]:
-        """Yield the detections of items in order, with up to two items in flight.
+        """Yields the detections of items in order, with up to two items in flight.
 
         The next item is read and prepared while the device processes the current one.
         Therefore a result is yielded after the next item was requested: for a live sensor,
@@ -450,7 +450,7 @@ class Detector:
         image: Images | None = None,
         camera: Calibrations | None = None,
     ) -> Detector:
-        """Compile the model, so that the first call is fast.
+        """Compiles the model, so that the first call is fast.
 
         Args:
             sample: Frames like those of later calls, such as one tesseract; or the batch
@@ -476,13 +476,13 @@ class Detector:
         return self
 
     def detect_function(self) -> Callable[..., Detections]:
-        """Return the pure function that is jitted: `detect` with this model and options."""
+        """Returns the pure function that is jitted: `detect` with this model and options."""
         mapping = self.saved.config.data.azimuth_mapping
         grid = models.map_grid(self.grid, self.model, mapping)
         return functools.partial(detect, self.model, grid, self.decode_options)
 
     def put(self, x: Shaped[Array, "b ..."]) -> Shaped[jax.Array, "B ..."]:
-        """Copy the rows of this process to the devices; the caller may then reuse `x`.
+        """Copies the rows of this process to the devices; the caller may then reuse `x`.
 
         NumPy arrays need care: on CPU, `device_put` shares aligned memory regardless of
         `may_alias`, so the array is copied first; on other platforms the transfer is
@@ -511,7 +511,7 @@ class Detector:
 
 
 def _reversed(x: Shaped[Any, "B ..."]) -> Shaped[Any, "B ..."]:
-    """Reverse the order of all axes but the first."""
+    """Reverses the order of all axes but the first."""
     return x.transpose(0, *range(x.ndim - 1, 0, -1))
 
 
@@ -519,6 +519,6 @@ _reverse = jax.jit(_reversed)
 
 
 def _padded(x: Shaped[Array, "b ..."], size: int) -> Shaped[Array, "{size} ..."]:
-    """Pad a batch to a batch size by repeating its last frame."""
+    """Pads a batch to a batch size by repeating its last frame."""
     count = x.shape[0]
     return x if count == size else x[np.minimum(np.arange(size), count - 1)]

@@ -38,7 +38,7 @@ def embed_dataset(
     resize: bool = False,
     batch_size: int = 8,
 ) -> PreprocessReport:
-    """Write the backbone's features of every front image that has none in the folder yet.
+    """Writes the backbone's features of every front image that has none in the folder yet.
 
     Corrupted images are skipped and reported; the next call tries them again. Frames
     without an image, and embeddings whose image has changed since, are counted in warnings.

@@ -107,7 +107,7 @@ def export(
     half: bool = False,
     radar_input: str = "projection",
 ) -> tuple[int, list[str]]:
-    """Write a folder with the model, which replaces an earlier export.
+    """Writes a folder with the model, which replaces an earlier export.
 
     Args:
         detector: Detector to export. Its thresholds and region of interest become the
@@ -178,7 +178,7 @@ def export(
 
 
 def _radar_shape(detector: Detector, radar_input: str) -> tuple[int, ...]:
-    """Return the shape of one frame of the radar data with which a program begins."""
+    """Returns the shape of one frame of the radar data with which a program begins."""
     require(radar_input in INPUTS, "input", radar_input, f"one of {INPUTS}")
     if radar_input == "projection":
         *bins, channels = detector.grid.projection_shape
@@ -193,7 +193,7 @@ def _radar_shape(detector: Detector, radar_input: str) -> tuple[int, ...]:
 
 
 def _jax_versions() -> dict[str, str]:
-    """Return the smallest and largest version of JAX that can read a program.
+    """Returns the smallest and largest version of JAX that can read a program.
 
     Versions older than the tested ones may lack operations that newer ones write. JAX
     reads what was exported six months before, which is about two minor versions.
@@ -215,7 +215,7 @@ def _readme(
     content: JsonObject,
     names: Iterable[str],
 ) -> str:
-    """Return the text of the model card of a folder.
+    """Returns the text of the model card of a folder.
 
     Args:
         detector: The detector.
@@ -256,7 +256,7 @@ def _readme(
 
 
 def _origin(content: JsonObject) -> str:
-    """Return the rows of a table of what identifies a model."""
+    """Returns the rows of a table of what identifies a model."""
     known = {"run": "not known", "metrics": None} | content["identity"]
     known["export"] = {"radejax": content["radejax"], "commit": content["commit"]}
     classes = content["config"]["classes"]
@@ -280,7 +280,7 @@ def _array(*shape: int, dtype: DTypeLike = jnp.float32) -> jax.ShapeDtypeStruct:
 
 
 def _settings(detector: Detector) -> dict[str, jax.ShapeDtypeStruct]:
-    """Return the shapes of the fields of `Settings`, in their order."""
+    """Returns the shapes of the fields of `Settings`, in their order."""
     given = Settings.of(detector.saved.config, {})
     return {n: _array(*x.shape) for n, x in given._asdict().items()}
 
@@ -288,7 +288,7 @@ def _settings(detector: Detector) -> dict[str, jax.ShapeDtypeStruct]:
 def _exported(
     detector: Detector, shape: Sequence[int], batch: Any, with_backbone: bool
 ) -> tuple[MutableVariableDict, tuple[PyTree, ...]]:
-    """Return the variables of a program and the shapes of its inputs.
+    """Returns the variables of a program and the shapes of its inputs.
 
     The inputs are projections or tensors and, for a radar-camera model, images and a
     dictionary of the camera's fields. Without the image transformer, the images are
@@ -310,7 +310,7 @@ def _exported(
 
 
 def _names(shapes: Sequence[PyTree]) -> list[str]:
-    """Return the names of the leaves of the inputs that `_exported` returns."""
+    """Returns the names of the leaves of the inputs that `_exported` returns."""
     radar = "projection" if len(shapes[0].shape) == 4 else "tensor"
     names = [radar, "image"][: len(shapes)]
     return names + [f"camera_{n}" for n in sorted(shapes[2])] if shapes[2:] else names
@@ -343,7 +343,7 @@ def _described(
     arrays: Iterable[tuple[str, _Shaped]],
     other: str = "weights: the tensor in model.safetensors",
 ) -> bytes:
-    """Return a list of the inputs or outputs of a program as JSON, null for any size.
+    """Returns a list of the inputs or outputs of a program as JSON, null for any size.
 
     Args:
         arrays: Names and shapes.
@@ -365,7 +365,7 @@ def _described(
 def _detect(
     detector: Detector, variables: VariableDict, inputs: PyTree, settings: Settings
 ) -> dict[str, jax.Array]:
-    """Run the detector on inputs in the shapes of `_exported`, for both program formats."""
+    """Runs the detector on inputs in the shapes of `_exported`, for both program formats."""
     radar, *rest = inputs
     image, camera = (rest[0], Camera(**rest[1])) if rest else (None, None)
     function = detector.detect_function()
@@ -383,7 +383,7 @@ def _detect(
 
 @contextlib.contextmanager
 def _without_locations() -> Iterator[None]:
-    """Leave source files out of programs, which are then the same on other machines."""
+    """Leaves source files out of programs, which are then the same on other machines."""
     name = "jax_traceback_in_locations_limit"
     limit = getattr(jax.config, name)
     jax.config.update(name, 0)
@@ -400,7 +400,7 @@ def _stablehlo(
     batch_size: int | None,
     with_backbone: bool,
 ) -> dict[str, bytes]:
-    """Return the program from weights, inputs and settings to detections, in files.
+    """Returns the program from weights, inputs and settings to detections, in files.
 
     The result of the program is a dictionary of arrays. The batch size is symbolic if
     `batch_size` is None. Without the backbone, the images are embedded ones. With a batch
@@ -436,7 +436,7 @@ def _stablehlo(
 
 
 def _onnx_metadata(detector: Detector) -> dict[str, object]:
-    """Return the metadata of the model that an ONNX file contains, by name."""
+    """Returns the metadata of the model that an ONNX file contains, by name."""
     return {
         "radejax": __version__,
         "commit": radejax_commit(),
@@ -449,7 +449,7 @@ def _onnx_metadata(detector: Detector) -> dict[str, object]:
 
 
 def _simplified(model: Any) -> Any:
-    """Return an ONNX model with folded constants, so that runtimes can quantize kernels."""
+    """Returns an ONNX model with folded constants, so that runtimes can quantize kernels."""
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
@@ -470,7 +470,7 @@ def _simplified(model: Any) -> Any:
 def _onnx_files(
     detector: Detector, shape: Sequence[int], batch_size: int, with_backbone: bool
 ) -> dict[str, bytes]:
-    """Return the contents of the ONNX files and their inputs and outputs by file name.
+    """Returns the contents of the ONNX files and their inputs and outputs by file name.
 
     `network.onnx` contains the network, and `detector.onnx` also decoding and rotated NMS.
 

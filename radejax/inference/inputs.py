@@ -78,7 +78,7 @@ class InputReader:
     data: DataOptions
 
     def read_radar(self, frames: Frames, num_frames: int = 1) -> Real[Array, "B ..."]:
-        """Combine radar frames into one array with a leading axis B.
+        """Combines radar frames into one array with a leading axis B.
 
         Args:
             frames: Radar data: an array, a path, or a list of arrays and paths, see
@@ -132,7 +132,7 @@ class InputReader:
         return read_frame(path, self.grid)
 
     def _projected(self, frames: object) -> Real[Array, "..."]:
-        """Convert to an array that JAX accepts; frames of a reduced release become projections."""
+        """Converts to an array that JAX accepts; frames of a reduced release become projections."""
         array = as_numbers(frames, "frames")
         if reduced.is_reduced(array, self.grid):
             if array.shape[1] != 4:  # an error below explains points [N, 4]
@@ -144,7 +144,7 @@ class InputReader:
     def read_cameras(
         self, image: Images | None, camera: Calibrations | None, num_frames: int
     ) -> tuple[Real[Array, "B _ _ _"] | None, Camera | None, int]:
-        """Convert images and cameras to arrays, as the data pipeline makes them.
+        """Converts images and cameras to arrays, as the data pipeline makes them.
 
         Args:
             image: Images `[B, H, W, 3]` uint8 (or `[H, W, 3]` for a single frame), the
@@ -197,7 +197,7 @@ class InputReader:
 def _images(
     given: Images, cameras: Camera, model: DinoRade, resize: bool
 ) -> tuple[Real[Array, "B _ _ _"], Bool[np.ndarray, " B"]]:
-    """Return the images as one array, and a mask that is True where one is given."""
+    """Returns the images as one array, and a mask that is True where one is given."""
     size = model.options.image.size
     calibrated_px = np.asarray(cameras.size_px, int)
 
@@ -231,7 +231,7 @@ def _images(
 def _batched(
     given: Calibrations | None, num_frames: int, none: Camera, options: CameraOptions
 ) -> Camera:
-    """Combine the cameras of all frames, `none` for missing ones, into one `Camera`."""
+    """Combines the cameras of all frames, `none` for missing ones, into one `Camera`."""
     if isinstance(given, Camera) and np.ndim(given.is_valid) == 1:
         return given
     if given is None or isinstance(given, (Camera, CameraCalibration, _PATH)):
@@ -259,7 +259,7 @@ def _one_camera(camera: Camera | Calibration, options: CameraOptions) -> Camera:
 def _read_paths(
     given: Frames | Images, read: Callable[[pathlib.Path, int], np.ndarray]
 ) -> Array | list[Array | None]:
-    """Replace paths by the arrays that they contain.
+    """Replaces paths by the arrays that they contain.
 
     An array is returned unchanged. A path or a list becomes a list of arrays and None.
     `read` is called with the path and its position in the list.
@@ -274,7 +274,7 @@ def _read_paths(
 
 
 def as_numbers(values: object, name: str) -> Real[Array, "..."]:
-    """Convert an array of any kind of real numbers to one that JAX accepts.
+    """Converts an array of any kind of real numbers to one that JAX accepts.
 
     Args:
         values: Array; those on a device are returned unchanged.
@@ -301,7 +301,7 @@ def as_numbers(values: object, name: str) -> Real[Array, "..."]:
 def check_backbone(
     image: Real[Array, "B _ _ _"] | None, variables: VariableDict
 ) -> None:
-    """Check that the variables contain the image backbone if images require it.
+    """Checks that the variables contain the image backbone if images require it.
 
     Args:
         image: Images `[B, H, W, 3]`, embedded images, or None.
@@ -332,7 +332,7 @@ class Settings(NamedTuple):
 
     @classmethod
     def of(cls, config: Config, changes: dict[str, object]) -> Settings:
-        """Return the values of a config, and those that replace them, as float32 arrays."""
+        """Returns the values of a config, and those that replace them, as float32 arrays."""
         values: dict[str, Any] = dict(config.decode) | changes
         least = np.asarray(values["score_threshold"], np.float32)
         return cls(
@@ -348,7 +348,7 @@ def check_settings(
     nms_iou: float | None,
     roi: Sequence[float] | str | None,
 ) -> dict[str, object]:
-    """Return the given values as fields of `config.decode`, without those that are None.
+    """Returns the given values as fields of `config.decode`, without those that are None.
 
     Raises:
         UserError: A value is out of its range, or a class is unknown.

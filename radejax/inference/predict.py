@@ -26,7 +26,7 @@ Batches = Iterable[tuple[Int[Array, " B"], Item]]
 def detect_batches(
     detector: Detector, parts: Iterable[Batches], num_frames: int, *, progress: bool
 ) -> Iterator[tuple[Int[np.ndarray, " B"], Detections]]:
-    """Detect the objects in batches of frames, of which two are in flight.
+    """Detects the objects in batches of frames, of which two are in flight.
 
     Args:
         detector: Detector.
@@ -65,7 +65,7 @@ def predict_dataset(
     should_stop: Callable[[], bool] | None = None,
     each_batch: Callable[[Batch], None] | None = None,
 ) -> Boxes:
-    """Detect the objects in every frame on the devices of the detector.
+    """Detects the objects in every frame on the devices of the detector.
 
     Every process returns the detections of all frames.
 

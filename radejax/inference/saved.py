@@ -101,7 +101,7 @@ class SavedModel:
         return models.build(self.config.model, self.config.data.num_frames)
 
     def check_input(self, mean: float, spread: float) -> bool:
-        """Return whether the input is similar to that of the training; warn if it is not.
+        """Returns whether the input is similar to that of the training; warns if it is not.
 
         Args:
             mean: Mean of some projections.
@@ -125,7 +125,7 @@ class SavedModel:
 def load_model(
     path: PathLike, *, step: Step = None, image_backbone: PathLike | None = None
 ) -> SavedModel:
-    """Load the model of a run, a checkpoint, an exported folder or an official file.
+    """Loads the model of a run, a checkpoint, an exported folder or an official file.
 
     Checkpoints do not contain a frozen image backbone, so it is read from the files that
     the run was trained with. If they do not exist, the model accepts embedded images only.
@@ -163,7 +163,7 @@ def load_torch(
     image_backbone: PathLike | None = None,
     **model_overrides: object,
 ) -> SavedModel:
-    """Load official RADE-Net or DinoRADE weights on the grid of K-Radar.
+    """Loads official RADE-Net or DinoRADE weights on the grid of K-Radar.
 
     Args:
         path_or_state_dict: `.pth`, `.pt` or `.safetensors` file, or a mapping of names
@@ -219,7 +219,7 @@ def save_model(
     programs: Mapping[str, bytes] | None = None,
     jax_versions: Mapping[str, str] | None = None,
 ) -> JsonObject:
-    """Write a model to a folder as `config.json` and `model.safetensors`.
+    """Writes a model to a folder as `config.json` and `model.safetensors`.
 
     Args:
         saved: Model to write.
@@ -277,7 +277,7 @@ def save_model(
 
 
 def _read_exported(folder: pathlib.Path) -> SavedModel:
-    """Read a folder that `save_model` wrote."""
+    """Reads a folder that `save_model` wrote."""
     path = folder / CONFIG_FILE
     weights = folder / WEIGHTS_FILE
     content = files.read_object(path)
@@ -319,7 +319,7 @@ def _is_checkpoint(path: pathlib.Path) -> bool:
 
 
 def _read_checkpoint(path: pathlib.Path, step: Step) -> SavedModel:
-    """Read the model of a workdir, its `checkpoints`, or one of them."""
+    """Reads the model of a workdir, its `checkpoints`, or one of them."""
     if _is_checkpoint(path):
         folder = path.parent
         step = int(path.name)
@@ -364,7 +364,7 @@ def _read_checkpoint(path: pathlib.Path, step: Step) -> SavedModel:
 
 
 def _with_calibration(config: Config, workdir: pathlib.Path, step: int) -> Config:
-    """Return a config with the calibration of the run if it is that of the step."""
+    """Returns a config with the calibration of the run if it is that of the step."""
     path = workdir / CALIBRATION_FILE
     if not path.exists():
         return config
@@ -378,7 +378,7 @@ def _with_calibration(config: Config, workdir: pathlib.Path, step: int) -> Confi
 
 
 def _identity(workdir: pathlib.Path, step: int, run: JsonObject) -> JsonObject:
-    """Return what identifies a checkpoint, without paths of this machine."""
+    """Returns what identifies a checkpoint, without paths of this machine."""
     metrics = None
     for evaluation, found in _evaluations(workdir, step):
         if metrics is None and found["split"] == "test":
@@ -402,7 +402,7 @@ def _identity(workdir: pathlib.Path, step: int, run: JsonObject) -> JsonObject:
 def _evaluations(
     workdir: pathlib.Path, step: int | None
 ) -> Iterator[tuple[str, JsonObject]]:
-    """Yield the folders of the evaluations of a step and the content of metrics.json."""
+    """Yields the folders of the evaluations of a step and the content of metrics.json."""
     for path in sorted(workdir.glob("evaluation*/metrics.json")):
         found = files.read_object(path)
         if found.get("step") == step:
@@ -412,7 +412,7 @@ def _evaluations(
 def with_chosen_thresholds(
     saved: SavedModel, workdir: PathLike, rule: str
 ) -> SavedModel:
-    """Return a model of a run with the score thresholds that an evaluation chose.
+    """Returns a model of a run with the score thresholds that an evaluation chose.
 
     It is the first evaluation that chose them on the validation split, or else on its own
     frames. Classes without a threshold keep that of the config, which is logged.
@@ -452,7 +452,7 @@ def with_chosen_thresholds(
 
 
 def _with_backbone(saved: SavedModel, given: PathLike | None) -> SavedModel:
-    """Add the weights of the image backbone to a model, if they are available.
+    """Adds the weights of the image backbone to a model, if they are available.
 
     They are read from the given file or folder, else from the one that the run was
     trained with, else from the weights that the run started from.
@@ -495,7 +495,7 @@ def starting_weights(
     image_backbone_path: PathLike | None = None,
     embeddings_sha256: str | None = None,
 ) -> tuple[VariableDict | None, VariableDict | None, str | None]:
-    """Read the weights that a training starts from, including frozen ones.
+    """Reads the weights that a training starts from, including frozen ones.
 
     Args:
         options: The section `config.model`.
@@ -532,7 +532,7 @@ def starting_weights(
 
 
 def _fitting_variables(path: PathLike, options: RadeNetOptions) -> VariableDict:
-    """Read the weights of another run or an official file, which must fit `config.model`."""
+    """Reads the weights of another run or an official file, which must fit `config.model`."""
     wanted = options.to_dict()
     if files.as_path(path).is_dir():
         other = load_model(path)
@@ -548,7 +548,7 @@ def _fitting_variables(path: PathLike, options: RadeNetOptions) -> VariableDict:
 
 
 def matching_weights(path: PathLike, model: RadeNet) -> VariableDict:
-    """Read those weights of another model that have the name and shape of a model's.
+    """Reads those weights of another model that have the name and shape of a model's.
 
     The numbers of arrays, and the parts of the model with arrays that do not match, are
     logged. Weights of a frozen image backbone are not taken.

@@ -104,7 +104,7 @@ class Data:
             self.frames.grid = self.frames.grid.without_doppler()
 
     def describe(self) -> JsonObject:
-        """Return names, kind and license of the data, without paths of this machine."""
+        """Returns names, kind and license of the data, without paths of this machine."""
         return {
             "name": ", ".join(as_path(root).name for root in self.options.roots),
             "format": self.options.format,
@@ -113,7 +113,7 @@ class Data:
         }
 
     def preprocess(self) -> None:
-        """Write the missing records on the main process while the others wait.
+        """Writes the missing records on the main process while the others wait.
 
         `split` then leaves out frames whose radar tensor is missing or corrupted.
 
@@ -136,7 +136,7 @@ class Data:
         return records.open_projections(self._records_folder, self.frames.grid)
 
     def split(self, name: str, *, may_be_empty: bool = False) -> Frames:
-        """Return the frames of a split.
+        """Returns the frames of a split.
 
         Frames that `preprocess` skipped are left out and counted. The sequences that
         `options.validation` holds out of "train" form the split "validation".
@@ -166,11 +166,11 @@ class Data:
         return self._splits[name]
 
     def _chosen(self, frames: Frames) -> Frames:
-        """Return the frames of the chosen sequences and weathers."""
+        """Returns the frames of the chosen sequences and weathers."""
         return frames.part(self.options.sequences, self.options.weather)
 
     def _part_of_train(self, name: str) -> Frames:
-        """Return the part of the train split that is trained on, or is held out.
+        """Returns the part of the train split that is trained on, or is held out.
 
         Args:
             name: "train" or "validation".
@@ -205,14 +205,14 @@ class Data:
         return self.input_of("train")
 
     def input_of(self, split: str) -> tuple[float, float]:
-        """Return mean and standard deviation of the records of some frames of a split."""
+        """Returns mean and standard deviation of the records of some frames of a split."""
         frames = list(self.split(split))
         some = frames[:: -(-len(frames) // _INPUT_FRAMES)]
         values = np.stack([decode(self.records[frame.key]) for frame in some])
         return float(values.mean()), float(values.std())
 
     def images(self, frames: FrameSequence) -> cameras.CameraInputs | None:
-        """Return the images and cameras of frames, or None for a radar-only model.
+        """Returns the images and cameras of frames, or None for a radar-only model.
 
         Raises:
             UserError: Images or calibrations are missing or of another size.
@@ -225,7 +225,7 @@ class Data:
     def training_batches(
         self, frames: FrameSequence, train: TrainOptions, seed: int
     ) -> grain.DatasetIterator[Batch]:
-        """Return an endless, shuffled, checkpointable iterator over this process's batches.
+        """Returns an endless, shuffled, checkpointable iterator over this process's batches.
 
         Args:
             frames: Frames to train on.
@@ -273,7 +273,7 @@ class Data:
 
 
 def located(config: Config) -> Config:
-    """Return a copy of a config with absolute paths in `config.data`.
+    """Returns a copy of a config with absolute paths in `config.data`.
 
     By default, the roots are the folder of the simulated dataset, and the records are
     below the first root.
@@ -308,13 +308,13 @@ def _check_exist(paths: Iterable[str | None]) -> None:
 
 
 def _simulated_root(simulation: SimulationOptions) -> str:
-    """Return the folder of a simulated dataset, whose name contains a hash of its config."""
+    """Returns the folder of a simulated dataset, whose name contains a hash of its config."""
     digest = hashlib.sha256(simulation.to_json().encode()).hexdigest()
     return f"data/simulated-{digest[:8]}"
 
 
 def _with_paths(config: Config, roots: Iterable[str]) -> Config:
-    """Return a config with absolute data paths; records are in the first root by default.
+    """Returns a config with absolute data paths; records are in the first root by default.
 
     Those without Doppler have a folder of their own.
     """
@@ -328,7 +328,7 @@ def _with_paths(config: Config, roots: Iterable[str]) -> Config:
 
 
 def simulate_missing(config: Config) -> None:
-    """Simulate the dataset of a config if it has a `simulation` section.
+    """Simulates the dataset of a config if it has a `simulation` section.
 
     Args:
         config: Config of the run with absolute paths, see `located`.
@@ -340,7 +340,7 @@ def simulate_missing(config: Config) -> None:
 
 
 def open_data(config: Config) -> Data:
-    """Simulate the data if the config requires it, write missing records, and open all.
+    """Simulates the data if the config requires it, writes missing records, and opens all.
 
     With several processes, the main process writes the files before the others read them.
 
@@ -398,7 +398,7 @@ def open_data(config: Config) -> Data:
 
 
 def _log_input(data: Data, model: RadeNetOptions) -> None:
-    """Log mean and standard deviation of the input; warn if it is nearly constant."""
+    """Logs mean and standard deviation of the input; warns if it is nearly constant."""
     mean, spread = data.usual_input
     _log.info("input: %.3f ± %.3f in the frames to train on", mean, spread)
     seen = model.input_scale * (mean - model.input_center)
@@ -416,7 +416,7 @@ def _log_input(data: Data, model: RadeNetOptions) -> None:
 def data_of_run(
     saved: SavedModel, changes: Mapping[str, Any] | None = None
 ) -> tuple[Config, Data]:
-    """Return the config of a run with changes of `config.data`, and the data it describes.
+    """Returns the config of a run with changes of `config.data`, and the data it describes.
 
     If `changes` replace the roots, the labels, records, embeddings, calibrations and the
     image backbone of the run are not used, and all sequences and weather conditions are
@@ -459,7 +459,7 @@ def data_of_run(
 
 
 def data_name(changes: Mapping[str, Any]) -> str:
-    """Return a name for results on other data from the changed fields of `config.data`.
+    """Returns a name for results on other data from the changed fields of `config.data`.
 
     It consists of the names of the first root and the labels, the sequences and the
     weather, or is "other" if none of them is changed.

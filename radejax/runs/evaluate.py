@@ -116,7 +116,7 @@ class Evaluation:
         self._detector = Detector(saved, placement, score_threshold=least)
 
     def predict(self, variables: VariableDict, **options: Any) -> Boxes:
-        """Detect objects in all frames of the split.
+        """Detects objects in all frames of the split.
 
         Args:
             variables: Variables of the model.
@@ -139,7 +139,7 @@ class Evaluation:
         variables: VariableDict,
         should_stop: Callable[[], bool] | None = None,
     ) -> Scores:
-        """Evaluate the variables of a model during training: APs and loss.
+        """Evaluates the variables of a model during training: APs and loss.
 
         Every process computes the same numbers, whose names begin with that of the split.
 
@@ -222,7 +222,7 @@ class Evaluation:
         run: str | None = None,
         choosing: Evaluation | None = None,
     ) -> Report | None:
-        """Detect objects, and write the tables and figures of an evaluation.
+        """Detects objects, and writes the tables and figures of an evaluation.
 
         Args:
             variables: Variables of the model.
@@ -277,7 +277,7 @@ class Evaluation:
         return make_set(self._truth, found, self._table, self._options)
 
     def _write_camera_share(self, variables: VariableDict, path: pathlib.Path) -> None:
-        """Write the mean weight of the camera by weather, computed on up to 256 frames."""
+        """Writes the mean weight of the camera by weather, computed on up to 256 frames."""
         some = figures.spread(self._frames, 256)
         maps = figures.frame_shares(self._detector.model, variables, self._data, some)
         shares = ((frame.weather, share) for frame, share in maps)
@@ -291,7 +291,7 @@ class Evaluation:
         data: EvaluationSet,
         folder: pathlib.Path,
     ) -> Iterator[SceneFigure]:
-        """Draw frames, write figures of the usual and the worst ones, and yield all.
+        """Draws frames, writes figures of the usual and the worst ones, and yields all.
 
         With visualizations, there are also frames of every class, weather and kind of
         mistake.
@@ -334,7 +334,7 @@ class Evaluation:
         folder: pathlib.Path,
         origin: str,
     ) -> None:
-        """Write a figure of all weathers and the loss curves."""
+        """Writes a figure of all weathers and the loss curves."""
         frames = self._frames
         suffix = ", simulated" if frames.is_simulated else ""
         ending = self._options.figures
@@ -351,7 +351,7 @@ class Evaluation:
                 save_figure(figure, folder / f"training.{ending}", origin)
 
     def _scene(self, predictions: Boxes, index: int, **fields: Any) -> Scene:
-        """Return the scene of a frame with its boxes and image.
+        """Returns the scene of a frame with its boxes and image.
 
         Predictions are drawn if their score reaches `config.decode.score_threshold`, the
         default of the detector.
@@ -376,14 +376,14 @@ class Evaluation:
         )
 
     def _spread(self, count: int) -> list[int]:
-        """Return the positions of a fixed selection of the split's frames with objects."""
+        """Returns the positions of a fixed selection of the split's frames with objects."""
         candidates = [i for i, frame in enumerate(self._frames) if len(frame.boxes)]
         return figures.spread(candidates, count)
 
     def _figures(
         self, predictions: Boxes, indices: Sequence[int]
     ) -> Iterator[tuple[str, Figure]]:
-        """Yield names and figures of frames by their positions in the split."""
+        """Yields names and figures of frames by their positions in the split."""
         for index in indices:
             frame = self._frames[index]
             name = f"{frame.sequence:02d}_{frame.name}"
@@ -391,7 +391,7 @@ class Evaluation:
 
 
 def report_options(config: Config, **changes: Any) -> ReportOptions:
-    """Return the options of a report on a run.
+    """Returns the options of a report on a run.
 
     Args:
         config: Config of the run.
@@ -418,7 +418,7 @@ def report_options(config: Config, **changes: Any) -> ReportOptions:
 
 
 def named_aps(results: Sequence[Result]) -> dict[str, float]:
-    """Return the APs over all frames by metric and class, and means by m and metric."""
+    """Returns the APs over all frames by metric and class, and means by m and metric."""
     return {
         f"m{x.metric}" if x.cls == "mean" else f"{x.metric}/{x.cls}": x.ap
         for x in results
@@ -438,7 +438,7 @@ def evaluate_run(
     run: str | None = None,
     **changes: Any,
 ) -> Report | None:
-    """Evaluate a checkpoint of a run with the settings of its config, on all devices.
+    """Evaluates a checkpoint of a run with the settings of its config, on all devices.
 
     Args:
         workdir: Workdir of `train.py`.
@@ -510,7 +510,7 @@ def evaluate_run(
 
 
 def calibrate_run(workdir: PathLike, **options: Any) -> JsonObject:
-    """Fit probabilities to the scores of a run, and write `calibration.json` to its workdir.
+    """Fits probabilities to the scores of a run, and writes them to its workdir.
 
     Models that are loaded from the workdir then predict them, see `DecodeOptions`. The
     predictions are evaluated too, in a folder of their own.
@@ -546,7 +546,7 @@ def calibrate_run(workdir: PathLike, **options: Any) -> JsonObject:
 
 
 def source_of(data: Data, split: str, shuffle_images: int | None = None) -> JsonObject:
-    """Return a description of the data and split of results as plain values."""
+    """Returns a description of the data and split of results as plain values."""
     return {
         "split": split,
         "shuffle_images": shuffle_images,
@@ -556,7 +556,7 @@ def source_of(data: Data, split: str, shuffle_images: int | None = None) -> Json
 
 
 def _check_source(out: pathlib.Path, source: JsonObject) -> None:
-    """Raise `UserError` if a folder contains results on other data than `source`."""
+    """Raises `UserError` if a folder contains results on other data than `source`."""
     if not (out / "source.json").exists():
         return
     found = files.read_object(out / "source.json")
@@ -567,7 +567,7 @@ def _check_source(out: pathlib.Path, source: JsonObject) -> None:
 
 
 def with_shuffled_images(data: Data, split: str, seed: int) -> list[LabelledFrame]:
-    """Return the frames of a split with images and calibrations shuffled among them.
+    """Returns the frames of a split with images and calibrations shuffled among them.
 
     Every frame that has an image gets the image and calibration of another one.
 

@@ -54,7 +54,7 @@ def frame_scene(
     iou: float = 0.3,
     **fields: Any,
 ) -> Scene:
-    """Create the scene of a labelled frame with its boxes, image, calibration and title.
+    """Creates the scene of a labelled frame with its boxes, image, calibration and title.
 
     Predictions are matched to the objects inside the region by the protocol `all_point`, so
     that figures show which are correct.
@@ -83,7 +83,7 @@ def frame_scene(
 
 
 def draw_training_samples(config: Config, count: int = 4) -> Figure:
-    """Draw the first frames of a training as the network gets them.
+    """Draws the first frames of a training as the network gets them.
 
     Args:
         config: Config of the run. Data are simulated and preprocessed as for a run.
@@ -119,7 +119,7 @@ def draw_training_samples(config: Config, count: int = 4) -> Figure:
 
 
 def _input_scene(sample: Batch, data: Data, roi: tuple[float, ...] | None) -> Scene:
-    """Return the scene of one frame of a batch, without the axis of the batch."""
+    """Returns the scene of one frame of a batch, without the axis of the batch."""
     grid = data.records.grid
     # The channels of several frames are reduced to their maximum, which is drawn.
     power = decode(np.asarray(sample.projection)).max(-1, keepdims=True)
@@ -150,7 +150,7 @@ def _input_scene(sample: Batch, data: Data, roi: tuple[float, ...] | None) -> Sc
 
 
 def fullest_of_weathers(frames: FrameSequence) -> dict[str, int]:
-    """Return the position of the frame with the most objects for each weather.
+    """Returns the position of the frame with the most objects for each weather.
 
     The weathers are in the order of the tables, and unknown ones come last.
     """
@@ -167,7 +167,7 @@ def draw_compared(
     options: ReportOptions,
     ending: str,
 ) -> None:
-    """Draw a frame of each weather with the detections of several runs side by side.
+    """Draws a frame of each weather with the detections of several runs side by side.
 
     It is the evaluated frame with the most objects, and the detections are those above the
     operating score. Of a run with several seeds, the first one is drawn. If there are no
@@ -231,7 +231,7 @@ def draw_compared(
 
 
 def spread(values: Sequence[T], count: int) -> list[T]:
-    """Return at most `count` evenly spaced items."""
+    """Returns at most `count` evenly spaced items."""
     places = np.linspace(0, len(values) - 1, min(count, len(values)))
     return [values[int(i)] for i in np.round(places)]
 
@@ -242,7 +242,7 @@ def frame_shares(
     data: Data,
     frames: FrameSequence,
 ) -> Iterator[tuple[LabelledFrame, Float[np.ndarray, "R A"]]]:
-    """Yield every frame with a map of the camera's weight in the fusion, in [0, 1].
+    """Yields every frame with a map of the camera's weight in the fusion, in [0, 1].
 
     The weight is 0 in bins without a query that projects into the image, and everywhere
     if the frame has no image. The maps include the padding of the model's maps.
@@ -274,7 +274,7 @@ def frame_shares(
 def average_shares(
     shares: Iterable[tuple[str, Float[np.ndarray, "R A"]]], grid: RadarGrid
 ) -> dict[str, JsonObject]:
-    """Compute the mean weight of the camera by group over the bins in its view.
+    """Computes the mean weight of the camera by group over the bins in its view.
 
     Bins without a query that projects into the image have weight 0, which is not an output
     of the gate. Therefore every bin is first averaged over the frames that have it in view,
@@ -303,7 +303,7 @@ def average_shares(
 
 
 def mean_share(share: Float[np.ndarray, "R A"], grid: RadarGrid) -> float:
-    """Compute the mean of a map over the bins in view, whose weight is above 0.
+    """Computes the mean of a map over the bins in view, whose weight is above 0.
 
     Bins beyond the grid are padding and are ignored. The result is NaN if no bin is in view.
     """

@@ -42,7 +42,7 @@ def export_int8(
     roots: Sequence[str] | None = None,
     **settings: Any,
 ) -> tuple[int, list[str]]:
-    """Write an ONNX export in int8, whose README has the APs of float32 and int8.
+    """Writes an ONNX export in int8, whose README has the APs of float32 and int8.
 
     The ranges of the activations are those on frames of the validation split, or of the
     train split if nothing is held out. The APs are those on frames of the test split, with
@@ -90,7 +90,7 @@ def export_int8(
 
 
 def _quantize(folder: pathlib.Path, data: Data, frames: Sequence[LabelledFrame]) -> int:
-    """Replace the ONNX files of a folder; return by how many bytes they are smaller."""
+    """Replaces the ONNX files of a folder; returns by how many bytes they are smaller."""
     from onnxruntime import quantization
 
     content = files.read_object(folder / CONFIG_FILE)
@@ -122,7 +122,7 @@ def _quantize(folder: pathlib.Path, data: Data, frames: Sequence[LabelledFrame])
 def _aps(
     folder: pathlib.Path, config: Config, data: Data, frames: Sequence[LabelledFrame]
 ) -> dict[str, float]:
-    """Return the APs of the program of a folder by class, boxes and threshold."""
+    """Returns the APs of the program of a folder by class, boxes and threshold."""
     options = report_options(config)
     options = options.replace(protocols=options.protocols[:1], bootstrap=0)
     run = exported_loader.load(folder)

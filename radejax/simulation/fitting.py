@@ -48,7 +48,7 @@ _MAX_ELEMENTS = 128
 def fit_files(
     recordings: Sequence[files.PathLike], out: files.PathLike
 ) -> files.JsonObject:
-    """Estimate the parameters of a radar, and draw a recording beside a simulated frame.
+    """Estimates the parameters of a radar, and draws a recording beside a simulated frame.
 
     Args:
         recordings: Radar tensors, or folders that contain `tesseract_*.mat`, of one radar.
@@ -102,7 +102,7 @@ def _simulated(section: files.JsonObject) -> Tensor:
 
 
 def fit_radar(recordings: Iterable[Tensor], grid: RadarGrid) -> files.JsonObject:
-    """Estimate the fields of `simulation.radar` from recorded radar tensors.
+    """Estimates the fields of `simulation.radar` from recorded radar tensors.
 
     Args:
         recordings: Tensors of linear power.

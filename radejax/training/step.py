@@ -79,7 +79,7 @@ def make_schedule(train: TrainOptions, steps_per_epoch: int) -> optax.Schedule:
 
 
 def _cosine(train: TrainOptions, num_steps: int, _: int) -> optax.Schedule:
-    """Linear warm-up from zero, then half a cosine from the peak to the minimum."""
+    """Creates a schedule: linear from zero to the peak, then half a cosine to the minimum."""
     return optax.warmup_cosine_decay_schedule(
         0.0,
         train.learning_rate,
@@ -90,7 +90,7 @@ def _cosine(train: TrainOptions, num_steps: int, _: int) -> optax.Schedule:
 
 
 def _cyclic_cosine(train: TrainOptions, _: int, steps_per_epoch: int) -> optax.Schedule:
-    """Linear warm-up from zero, then the schedule of the released code.
+    """Creates a schedule: linear from zero, then that of the released code.
 
     The rate decreases in one epoch, increases in the next, and so on: this is torch's
     `CosineAnnealingLR` with `T_max = steps_per_epoch`, stepped per batch. Its closed form
@@ -156,7 +156,7 @@ def make_optimizer(
 def _adamw(
     train: TrainOptions, schedule: optax.Schedule
 ) -> optax.GradientTransformation:
-    """AdamW with torch's defaults and weight decay on every parameter."""
+    """Creates AdamW with torch's defaults and weight decay on every parameter."""
     return optax.adamw(schedule, weight_decay=train.weight_decay)
 
 

@@ -36,7 +36,7 @@ def draw_camera(
     lidar_m: Float[np.ndarray, "N 3"] | None = None,
     matches: style.Matches | None = None,
 ) -> Axes:
-    """Draw the edges and the tinted front faces of 3D boxes on an image.
+    """Draws the edges and the tinted front faces of 3D boxes on an image.
 
     Args:
         image: `[H, W, 3]` uint8, or float in [0, 1], with the size of the calibration.
@@ -91,7 +91,7 @@ def draw_camera(
 def _draw_boxes(
     ax: Axes, calibration: CameraCalibration, boxes: Boxes, look: style.Style
 ) -> list[style.Label]:
-    """Draw the boxes in front of the camera; return labels of boxes that are large enough."""
+    """Draws the boxes in front of the camera; returns labels of boxes that are large enough."""
     segments, is_visible = calibration.project_boxes(boxes.box, near_m=_NEAR_M)
     segments = segments - 0.5
     # The renderer does not clip lines correctly that end far outside the image.

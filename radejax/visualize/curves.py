@@ -28,7 +28,7 @@ def draw_precision_recall(
     title: str = "",
     labels: tuple[str, str] | None = None,
 ) -> Figure:
-    """Draw interpolated precision over recall, one line per class, condition or model.
+    """Draws interpolated precision over recall, one line per class, condition or model.
 
     With `labels`, the curves are other values from 0 to 1, such as F1 over the score, and are
     drawn as they are.
@@ -90,7 +90,7 @@ def _draw_panel(
 
 
 def read_metrics(path: files.PathLike) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Read the series of a run's `metrics.jsonl` as `(step [N], value [N])` by name.
+    """Reads the series of a run's `metrics.jsonl` as `(step [N], value [N])` by name.
 
     An incomplete last line of an interrupted run is ignored.
 
@@ -122,7 +122,7 @@ def draw_training(
     keys: Sequence[str],
     title: str = "",
 ) -> Figure:
-    """Draw the losses of a run over steps, one panel per key.
+    """Draws the losses of a run over steps, one panel per key.
 
     Args:
         series: `(step [N], value [N])` by name, as returned by `read_metrics`.
@@ -151,7 +151,7 @@ def draw_training(
 
 
 def moving_mean(values: Float[np.ndarray, " N"], width: int) -> Float[np.ndarray, " N"]:
-    """Compute the mean of the finite values among the last `width` values.
+    """Computes the mean of the finite values among the last `width` values.
 
     There are fewer values at the start. The mean is NaN if none is finite.
     """
@@ -165,7 +165,7 @@ def moving_mean(values: Float[np.ndarray, " N"], width: int) -> Float[np.ndarray
 
 
 def _line(i: int) -> dict[str, Any]:
-    """Return color and dash pattern of the i-th line; the first 24 lines all differ."""
+    """Returns color and dash pattern of the i-th line; the first 24 lines all differ."""
     return {
         "color": SERIES_COLORS[i % len(SERIES_COLORS)],
         "linestyle": _LINE_STYLES[(i + i // len(SERIES_COLORS)) % len(_LINE_STYLES)],

@@ -62,7 +62,7 @@ def draw_map(
     label: str = "",
     is_sideways: bool = False,
 ) -> Axes:
-    """Draw a range-azimuth map, such as a heatmap or attention, on the ground plane.
+    """Draws a range-azimuth map, such as a heatmap or attention, on the ground plane.
 
     Args:
         values: Map `[R, A]`.
@@ -116,7 +116,7 @@ def draw_map(
 def draw_comparison(
     maps: Mapping[str, Float[np.ndarray, "R A"]], grid: RadarGrid
 ) -> Figure:
-    """Draw range-azimuth maps of several recordings, their profiles and strongest echoes.
+    """Draws range-azimuth maps of several recordings, their profiles and strongest echoes.
 
     Args:
         maps: Mean power in dB by title.
@@ -143,7 +143,7 @@ def draw_comparison(
 
 
 def draw_bev(scene: Scene, *, color_limits: tuple[float, float] | None = None) -> Axes:
-    """Draw a figure of one frame on the ground plane.
+    """Draws a figure of one frame on the ground plane.
 
     It shows the region of interest and its surroundings, or the field of view if the
     scene has no region of interest.
@@ -162,7 +162,7 @@ def draw_bev(scene: Scene, *, color_limits: tuple[float, float] | None = None) -
 
 
 def _draw_ground(scene: Scene, is_sideways: bool = False, **options: Any) -> Axes:
-    """Draw map, region, boxes and sensor; `options` are passed to `draw_map`."""
+    """Draws map, region, boxes and sensor; `options` are passed to `draw_map`."""
     extent = _extent_m(scene.grid, scene.roi, 0.2 if is_sideways else 0.37)
     ax = draw_map(
         scene.power, scene.grid, extent=extent, is_sideways=is_sideways, **options
@@ -179,7 +179,7 @@ def _draw_ground(scene: Scene, is_sideways: bool = False, **options: Any) -> Axe
 
 
 def bin_edges(centers: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n+1"]:
-    """Return the edges of bins; a single bin is drawn with a width of 1."""
+    """Returns the edges of bins; a single bin is drawn with a width of 1."""
     if centers.size == 1:
         return np.array([centers[0] - 0.5, centers[0] + 0.5])
     edges: np.ndarray = values_at(centers, np.arange(centers.size + 1) - 0.5)
@@ -187,7 +187,7 @@ def bin_edges(centers: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n+1"]:
 
 
 def to_polar(points: Float[np.ndarray, "*points 2"]) -> Float[np.ndarray, "*points 2"]:
-    """Convert ground positions to azimuth in degrees, positive to the right, and range."""
+    """Converts ground positions to azimuth in degrees, positive to the right, and range."""
     x, y = points[..., 0], points[..., 1]
     polar: np.ndarray = np.stack([np.rad2deg(-np.arctan2(y, x)), np.hypot(x, y)], -1)
     return polar
@@ -196,7 +196,7 @@ def to_polar(points: Float[np.ndarray, "*points 2"]) -> Float[np.ndarray, "*poin
 def _draw_polar(
     ax: Axes, scene: Scene, color_limits: tuple[float, float], *, show_labels: bool
 ) -> None:
-    """Draw one frame in the network's coordinates, range over azimuth, one tile per bin.
+    """Draws one frame in the network's coordinates, range over azimuth, one tile per bin.
 
     The straight edges of boxes are curves in these coordinates.
     """
@@ -212,14 +212,14 @@ def _draw_polar(
 def _outlines_in_polar(
     points: Float[np.ndarray, "*lines points 2"],
 ) -> Float[np.ndarray, "*lines points 2"]:
-    """Convert outlines, which continue beyond 180 degrees instead of crossing the map."""
+    """Converts outlines, which continue beyond 180 degrees instead of crossing the map."""
     polar = to_polar(points)
     polar[..., 0] = np.unwrap(polar[..., 0], period=360.0)
     return polar
 
 
 def draw_frame(scene: Scene) -> Figure:
-    """Draw one frame: bird's-eye view, polar view and, if given, camera image.
+    """Draws one frame: bird's-eye view, polar view and, if given, camera image.
 
     Args:
         scene: Frame to draw; `frame_scene` creates that of a dataset's frame.
@@ -252,7 +252,7 @@ def draw_frame(scene: Scene) -> Figure:
 def draw_scenes(
     scenes: Sequence[Scene], *, color_limits: tuple[float, float] | None = None
 ) -> Figure:
-    """Draw scenes, one per row, each with its camera image to the left of its map.
+    """Draws scenes, one per row, each with its camera image to the left of its map.
 
     Args:
         scenes: One or more scenes. The legend is that of the scene with most kinds of boxes.
@@ -305,7 +305,7 @@ def draw_scenes(
 def draw_samples(
     samples: Sequence[tuple[Scene, Scene, Float[np.ndarray, "R A"]]], grid: RadarGrid
 ) -> Figure:
-    """Draw samples of a training, one per row, as the network gets them.
+    """Draws samples of a training, one per row, as the network gets them.
 
     Args:
         samples: For each sample the frame as it was recorded, the input with its boxes after
@@ -341,7 +341,7 @@ def draw_samples(
 
 
 def _draw_view(ax: Axes, scene: Scene, *, show_labels: bool = True) -> None:
-    """Draw the camera image, and the boxes on it if a calibration is given."""
+    """Draws the camera image, and the boxes on it if a calibration is given."""
     assert scene.image is not None
     if scene.camera is None:
         ax.imshow(np.asarray(scene.image))
@@ -362,7 +362,7 @@ def _draw_view(ax: Axes, scene: Scene, *, show_labels: bool = True) -> None:
 def _extent_m(
     grid: RadarGrid, roi: Sequence[float] | None, narrowest: float = 0.37
 ) -> Extent:
-    """Return the extent of the region and its surroundings, or of the field of view.
+    """Returns the extent of the region and its surroundings, or of the field of view.
 
     Narrow regions are widened: half of their width is at least `narrowest` of their length.
     """
@@ -378,7 +378,7 @@ def _extent_m(
 
 
 def _axes_for_extent(extent: Extent) -> Axes:
-    """Create axes in a new figure for an extent, with space for color bar and legend."""
+    """Creates axes in a new figure for an extent, with space for color bar and legend."""
     x0, x1, y0, y1 = extent
     scale = min(5.5 / (x1 - x0), 6.0 / (y1 - y0))
     width, height = scale * (y1 - y0), scale * (x1 - x0)
@@ -394,7 +394,7 @@ def _draw_over(
     show_labels: bool = True,
     label_pt: float = style.LABEL_PT,
 ) -> None:
-    """Draw the region of interest, the boxes with their headings, and labels.
+    """Draws the region of interest, the boxes with their headings, and labels.
 
     Args:
         ax: Axes of a map, whose limits and aspect must be final.
@@ -435,7 +435,7 @@ def _draw_over(
 
 
 def _heading_marks(boxes: Float[np.ndarray, "N 7"]) -> Float[np.ndarray, "N 2 2"]:
-    """Return line segments that show the heading of each box.
+    """Returns line segments that show the heading of each box.
 
     They start at the middle of the front edge and point outwards, so that the echo inside
     the box remains visible.
@@ -447,7 +447,7 @@ def _heading_marks(boxes: Float[np.ndarray, "N 7"]) -> Float[np.ndarray, "N 2 2"
 def _add_legend(
     owner: Axes | Figure, scene: Scene, *, show_counts: bool = True, **place: Any
 ) -> None:
-    """Add a legend with one handle per kind of line to axes or a figure."""
+    """Adds a legend with one handle per kind of line to axes or a figure."""
     counts: dict[style.Style, int] = {}
     for look, boxes in scene.sets:
         counts[look] = counts.get(look, 0) + len(boxes)
@@ -485,7 +485,7 @@ def _add_legend(
 
 
 def draw_slices(scene: Scene, *, range_idx: int | None = None) -> Figure:
-    """Draw range-azimuth, range-Doppler and azimuth-elevation maps on one color scale.
+    """Draws range-azimuth, range-Doppler and azimuth-elevation maps on one color scale.
 
     There is no map of an axis that the radar does not measure.
 
@@ -540,7 +540,7 @@ def draw_slices(scene: Scene, *, range_idx: int | None = None) -> Figure:
 def _outlines(
     boxes: Float[np.ndarray, "N 7"],
 ) -> tuple[list[Float[np.ndarray, "_ 2"]], ...]:
-    """Return the lines of boxes in the three slices, with bars at a Doppler of 0."""
+    """Returns the lines of boxes in the three slices, with bars at a Doppler of 0."""
     azimuth_range = [to_polar(outline) for outline in style.footprints(boxes, 8)]
     bars = []
     azimuth_elevation = []

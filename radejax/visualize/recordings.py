@@ -43,7 +43,7 @@ def animate(
     *,
     frames_per_second: float = 10.0,
 ) -> pathlib.Path:
-    """Write figures as the frames of a GIF file, which is replaced atomically.
+    """Writes figures as the frames of a GIF file, which is replaced atomically.
 
     Args:
         figures: Figures or a generator of figures, written at the size of the first one.
@@ -76,14 +76,14 @@ def animate(
 
 
 def _image_of(figure: Figure) -> Image.Image:
-    """Return a figure as an image."""
+    """Returns a figure as an image."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
 
 
 def _to_palette(image: Image.Image) -> Image.Image:
-    """Reduce an image to 256 colors, among them those of boxes.
+    """Reduces an image to 256 colors, among them those of boxes.
 
     A palette of the most frequent colors would lack them, as their lines are thin. The edges of
     lines and texts have darker shades of them.
@@ -97,7 +97,7 @@ def _to_palette(image: Image.Image) -> Image.Image:
 
 
 def write_recording(scenes: Iterable[Scene], path: PathLike) -> None:
-    """Write scenes to a recording (.rrd) that `rerun PATH` opens.
+    """Writes scenes to a recording (.rrd) that `rerun PATH` opens.
 
     Args:
         scenes: Frames in time order; use an iterator for constant memory.
@@ -132,7 +132,7 @@ def write_recording(scenes: Iterable[Scene], path: PathLike) -> None:
 def ground_mesh(
     grid: RadarGrid,
 ) -> tuple[Float[np.ndarray, "bins 3"], Int[np.ndarray, "T 3"]]:
-    """Return the vertices (bin centers at z = -2 m) and triangles of the ground mesh."""
+    """Returns the vertices (bin centers at z = -2 m) and triangles of the ground mesh."""
     centers = grid.bin_centers_ego().reshape(-1, 2)
     vertices = np.concatenate([centers, np.full((len(centers), 1), -2.0)], 1)
     index = np.arange(len(centers)).reshape(grid.num_range, grid.num_azimuth)
@@ -142,13 +142,13 @@ def ground_mesh(
 
 
 def yaw_quaternions(yaw_rad: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 4"]:
-    """Return the quaternions x, y, z, w of rotations about z."""
+    """Returns the quaternions x, y, z, w of rotations about z."""
     zero = np.zeros_like(yaw_rad)
     return np.stack([zero, zero, np.sin(yaw_rad / 2), np.cos(yaw_rad / 2)], -1)
 
 
 def _log_scene(stream: rerun.RecordingStream, scene: Scene, index: int) -> None:
-    """Log one frame's radar map, boxes, image and title."""
+    """Logs one frame's radar map, boxes, image and title."""
     import rerun as rr
 
     stream.set_time("frame", sequence=index)

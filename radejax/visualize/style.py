@@ -158,7 +158,7 @@ def styled_sets(
     predictions: Boxes | None,
     matches: Matches | None = None,
 ) -> list[tuple[Style, Boxes]]:
-    """Return ground truth and predictions with their styles; None is left out.
+    """Returns ground truth and predictions with their styles; None is left out.
 
     With `matches`, they are split into those found, missed, correct, wrong and not
     evaluated, of which the last are left out if there are none.
@@ -180,7 +180,7 @@ def styled_sets(
 
 
 def label_texts(boxes: Boxes) -> list[str]:
-    """Return the class name of each box, followed by its score if there is one."""
+    """Returns the class name of each box, followed by its score if there is one."""
     if boxes.score is None:
         return list(boxes.cls)
     pairs = zip(boxes.cls, boxes.score, strict=True)
@@ -190,7 +190,7 @@ def label_texts(boxes: Boxes) -> list[str]:
 def footprints(
     boxes: Float[np.ndarray, "N 7"], points_per_edge: int = 1
 ) -> Float[np.ndarray, "N {4*points_per_edge+1} 2"]:
-    """Return closed counter-clockwise outlines of boxes on the ground.
+    """Returns closed counter-clockwise outlines of boxes on the ground.
 
     Args:
         boxes: Boxes in the radar frame.
@@ -215,7 +215,7 @@ def draw_tiles(
     values: Float[np.ndarray, "rows columns"],
     color_limits: tuple[float, float] | None = None,
 ) -> QuadMesh:
-    """Draw one tile per value; the color limits are `color_limits_of(values)` by default."""
+    """Draws one tile per value; the color limits are `color_limits_of(values)` by default."""
     low, high = color_limits or color_limits_of(values)
     return ax.pcolormesh(
         edges_x, edges_y, values, cmap=COLOR_MAP, vmin=low, vmax=high, rasterized=True
@@ -223,7 +223,7 @@ def draw_tiles(
 
 
 def draw_points(ax: Axes, points: Float[np.ndarray, "N 2"]) -> None:
-    """Draw LiDAR points on axes of fixed limits, below the lines of boxes."""
+    """Draws LiDAR points on axes of fixed limits, below the lines of boxes."""
     x, y = points.T
     ax.scatter(x, y, s=0.6, color=LIDAR_COLOR, lw=0, zorder=2, rasterized=True)
 
@@ -235,7 +235,7 @@ def draw_lines(
     widths: ArrayLike,
     zorder: float = 4.0,
 ) -> None:
-    """Draw lines with a black outline of half a point, without changing the axes limits."""
+    """Draws lines with a black outline of half a point, without changing the axes limits."""
     for stroke, extra in (("black", 1.1), (color, 0.0)):
         collection = LineCollection(
             list(lines),
@@ -250,7 +250,7 @@ def draw_lines(
 def line_scales(
     ax: Axes, outlines: Iterable[Float[np.ndarray, "_ 2"]], full_pt: float
 ) -> Float[np.ndarray, " N"]:
-    """Return factors from 0.4 to 1 for the line widths of boxes.
+    """Returns factors from 0.4 to 1 for the line widths of boxes.
 
     Lines of boxes smaller than `full_pt` points are thinner, as they would otherwise fill
     the box. The size of a box is the shorter side of the bounding rectangle of its outline
@@ -262,7 +262,7 @@ def line_scales(
 
 
 def halo(width: float, color: str = "black") -> list[AbstractPathEffect]:
-    """Return path effects that outline lines and text to be legible on any map."""
+    """Returns path effects that outline lines and text to be legible on any map."""
     return [Stroke(linewidth=width, foreground=color), Normal()]
 
 
@@ -290,7 +290,7 @@ class Label(NamedTuple):
 
 
 def draw_labels(ax: Axes, labels: Sequence[Label], font_size: float = LABEL_PT) -> None:
-    """Write each text next to its outline, at a side where it covers no other text.
+    """Writes each text next to its outline, at a side where it covers no other text.
 
     Among these sides, the one where it covers the fewest outlines is used, and the
     label's own in a tie. A text that would cover another one at every side is left out, as
@@ -341,7 +341,7 @@ def draw_labels(ax: Axes, labels: Sequence[Label], font_size: float = LABEL_PT) 
 def _overlaps(
     one: Float[np.ndarray, "N 4"], other: Float[np.ndarray, "M 4"]
 ) -> Bool[np.ndarray, "N M"]:
-    """Return which rectangles (left, bottom, right, top) overlap."""
+    """Returns which rectangles (left, bottom, right, top) overlap."""
     is_before = one[:, None, :2] < other[:, 2:]
     is_after = one[:, None, 2:] > other[:, :2]
     overlaps: np.ndarray = np.all(is_before & is_after, axis=-1)
@@ -361,12 +361,12 @@ class _NotebookFigure(Figure):
 
 
 def new_figure(width_in: float, height_in: float, **options: Any) -> Figure:
-    """Return an empty figure outside pyplot's list of open figures."""
+    """Returns an empty figure outside pyplot's list of open figures."""
     return _NotebookFigure(figsize=(width_in, height_in), **{"dpi": 110, **options})
 
 
 def color_limits_of(values: np.ndarray) -> tuple[float, float]:
-    """Return color limits from the noise (20th percentile) to strong echoes (99.9th).
+    """Returns color limits from the noise (20th percentile) to strong echoes (99.9th).
 
     Non-finite values are ignored. The limits of a constant map differ by one.
     """
@@ -380,7 +380,7 @@ def color_limits_of(values: np.ndarray) -> tuple[float, float]:
 
 
 def figure_format(path: pathlib.Path) -> str:
-    """Return the format of a figure file; raise a `UserError` for unknown suffixes."""
+    """Returns the format of a figure file; raises a `UserError` for unknown suffixes."""
     suffix = path.suffix.lstrip(".").lower()
     supported = FigureCanvasBase.get_supported_filetypes()
     if suffix not in supported:
@@ -399,7 +399,7 @@ _KEYS = {
 
 
 def save_figure(figure: Figure, path: PathLike, description: str = "") -> pathlib.Path:
-    """Write a figure to a file, which is replaced atomically.
+    """Writes a figure to a file, which is replaced atomically.
 
     Args:
         figure: The figure.

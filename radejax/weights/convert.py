@@ -63,7 +63,7 @@ def from_torch(
     source: PathLike,
     ignored: str = r"\Z",
 ) -> MutableVariableDict:
-    """Convert named tensors to the variables of a model.
+    """Converts named tensors to the variables of a model.
 
     Args:
         rules: Rules of the model.
@@ -124,7 +124,7 @@ def from_torch(
 
 
 def to_torch(rules: Rules, variables: VariableDict) -> dict[str, np.ndarray]:
-    """Invert `from_torch`; kernels stored as `[in, out]` become `[out, in]` in all cases."""
+    """Inverts `from_torch`; kernels stored as `[in, out]` become `[out, in]` in all cases."""
     tensors = {}
     for path, leaf in flatten_dict(variables, sep="/").items():
         name = torch_name(rules, path)
@@ -137,7 +137,7 @@ def to_torch(rules: Rules, variables: VariableDict) -> dict[str, np.ndarray]:
 
 
 def torch_name(rules: Rules, path: str) -> str:
-    """Return the torch name of a Flax path such as "params/backbone/start/kernel".
+    """Returns the torch name of a Flax path such as "params/backbone/start/kernel".
 
     Raises:
         UserError: The module matches no rule.
@@ -154,17 +154,17 @@ def torch_name(rules: Rules, path: str) -> str:
 
 
 def to_torch_layout(path: str, value: np.ndarray) -> np.ndarray:
-    """Transpose a Flax variable to the layout of torch."""
+    """Transposes a Flax variable to the layout of torch."""
     return value.transpose(_torch_axes(path, value.ndim))
 
 
 def to_our_layout(path: str, value: np.ndarray) -> np.ndarray:
-    """Invert `to_torch_layout`."""
+    """Inverts `to_torch_layout`."""
     return value.transpose(np.argsort(_torch_axes(path, value.ndim)))
 
 
 def _torch_axes(path: str, ndim: int) -> tuple[int, ...]:
-    """Return the axes of a Flax variable in the order of torch."""
+    """Returns the axes of a Flax variable in the order of torch."""
     if not path.endswith("kernel"):
         return tuple(range(ndim))
     if ndim == 4:
@@ -173,7 +173,7 @@ def _torch_axes(path: str, ndim: int) -> tuple[int, ...]:
 
 
 def variable_shapes(model: RadeNet) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of a detector's variables by path, without creating the variables."""
+    """Returns the shapes of a detector's variables by path, without creating the variables."""
     options = model.options
     bins = options.pad_multiple
     channels = model.num_frames * (options.doppler_bins + options.elevation_bins)
@@ -183,14 +183,14 @@ def variable_shapes(model: RadeNet) -> dict[str, tuple[int, ...]]:
 
 
 def check_finite(variables: VariableDict, source: PathLike) -> None:
-    """Raise a `DataError` that names the first variable with NaN or infinite values."""
+    """Raises a `DataError` that names the first variable with NaN or infinite values."""
     for path, leaf in flatten_dict(dict(variables), sep="/").items():
         if not np.isfinite(leaf).all():
             raise DataError(f"{source}: {path} has values that are not finite")
 
 
 def shapes_of(variables: VariableDict) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the leaves by path."""
+    """Returns the shapes of the leaves by path."""
     flat = flatten_dict(dict(variables), sep="/")
     return {path: tuple(leaf.shape) for path, leaf in flat.items()}
 
@@ -201,7 +201,7 @@ def shapes_of(variables: VariableDict) -> dict[str, tuple[int, ...]]:
 def read_state_dict(
     content_or_path: PathLike | StateDict, *parts: str
 ) -> tuple[StateDict, str]:
-    """Read the state dict in a file or checkpoint and remove the prefix of its names.
+    """Reads the state dict in a file or checkpoint and removes the prefix of its names.
 
     Args:
         content_or_path: Tensors by name, a checkpoint with such a mapping under one key, or
@@ -242,7 +242,7 @@ def read_state_dict(
 
 
 def to_numpy(tensor: object) -> np.ndarray:
-    """Convert a NumPy, JAX or torch array to NumPy; torch's bfloat16 becomes float32."""
+    """Converts a NumPy, JAX or torch array to NumPy; torch's bfloat16 becomes float32."""
     if hasattr(tensor, "detach"):  # a torch tensor; checked without importing torch
         host = tensor.detach().cpu()
         tensor = (host.float() if "bfloat16" in str(host.dtype) else host).numpy()

@@ -33,7 +33,7 @@ def read(
     dinov3: PathLike | None = None,
     **model_overrides: object,
 ) -> tuple[DinoRadeOptions, MutableVariableDict]:
-    """Return the options and the variables of tensors by official name.
+    """Returns the options and the variables of tensors by official name.
 
     The geometry is the released one. The camera is `CameraCalibration.from_kradar(file,
     radar_from_lidar_m=OFFICIAL_OFFSET_M).camera("pinhole")`, see `radejax.models.lifting`.
@@ -87,7 +87,7 @@ def read(
 def _transformer(
     tensors: StateDict, source: str, dinov3: PathLike | None
 ) -> tuple[dict[str, object], Collection | None]:
-    """Return fields and parameters of the transformer in the folder, else the checkpoint."""
+    """Returns fields and parameters of the transformer in the folder, else the checkpoint."""
     if dinov3 is not None:
         vit, variables = dinov3_hf.load(dinov3)
         is_dinov3 = not vit.options.position_grid
@@ -104,7 +104,7 @@ def _transformer(
 
 
 def infer_fusion(tensors: StateDict, overrides: JsonObject) -> JsonObject:
-    """Infer fields of `config.model.fusion` from names and shapes, and apply the overrides."""
+    """Infers fields of `config.model.fusion` from names and shapes, and applies the overrides."""
     has_weights = any(n.startswith("fusion.weighting_network.") for n in tensors)
     has_necks = any(n.startswith("fusion.rad_neck.") for n in tensors)
     fields = {"weighting": "cnn" if has_weights else "off", "necks": has_necks}
@@ -150,13 +150,13 @@ _RESNET: Rules = (
 
 
 def rules(heads: str, is_resnet: bool) -> Rules:
-    """Return the rules from modules of `DinoRade` to official names, for `convert`."""
+    """Returns the rules from modules of `DinoRade` to official names, for `convert`."""
     image = _RESNET if is_resnet else _CAMERA_NECK
     return (*image, *_FUSION, *radenet_torch.rules(heads, "rad_"))
 
 
 def without_lora(tensors: StateDict) -> StateDict:
-    """Merge low-rank adapters (PEFT) into the weights that they adapt: W + B A.
+    """Merges low-rank adapters (PEFT) into the weights that they adapt: W + B A.
 
     The factor alpha / rank is 1, because both are 16 in the released settings. These settings
     also never train the adapters, so B is zero.

@@ -51,7 +51,7 @@ _KINDS = r"dinov3_vit|dinov2|dinov2_with_registers|vit_\w+_dinov3(_qkvb)?"
 
 
 def _constants(gated_mlp: bool) -> JsonObject:
-    """Return the fields of Hugging Face's config for which only one value is supported."""
+    """Returns the fields of Hugging Face's config for which only one value is supported."""
     return {
         "model_type": "dinov3_vit",
         "rope_theta": 100.0,
@@ -120,7 +120,7 @@ _DINOV2: Rules = (  # in Hugging Face, where transformers 5 adds "model." to som
 
 
 def to_hugging_face(tensors: StateDict) -> dict[str, np.ndarray]:
-    """Return the tensors of any source under DINOv3's names in Hugging Face."""
+    """Returns the tensors of any source under DINOv3's names in Hugging Face."""
     tensors = dict(tensors)
     if "blocks.0.gamma_1" in tensors and not any(n.endswith("_bias") for n in tensors):
         # Most of timm's models are without the biases, because they are zero.
@@ -145,7 +145,7 @@ def to_hugging_face(tensors: StateDict) -> dict[str, np.ndarray]:
 
 
 def load(folder: PathLike) -> tuple[ViT, MutableVariableDict]:
-    """Load model and variables from a download.
+    """Loads model and variables from a download.
 
     Args:
         folder: Folder such as a download of `facebook/dinov3-vits16-pretrain-lvd1689m` or
@@ -177,7 +177,7 @@ def load(folder: PathLike) -> tuple[ViT, MutableVariableDict]:
 
 
 def _read_config(folder: pathlib.Path) -> JsonObject:
-    """Read the config of a model of Hugging Face or timm after checking what it describes."""
+    """Reads the config of a model of Hugging Face or timm after checking what it describes."""
     if (folder / f"{WEIGHTS_FILE}.index.json").is_file():
         raise UserError(
             f"{folder} has its weights in several files: load it with transformers and "
@@ -199,7 +199,7 @@ def _read_config(folder: pathlib.Path) -> JsonObject:
 
 
 def save(model: ViT, params: Collection, folder: PathLike) -> None:
-    """Write a model to a folder that `load` and Hugging Face transformers can read.
+    """Writes a model to a folder that `load` and Hugging Face transformers can read.
 
     Args:
         model: Model whose fields are written to `config.json`.
@@ -220,7 +220,7 @@ def save(model: ViT, params: Collection, folder: PathLike) -> None:
 
 
 def model_from_config(config: JsonObject, sizes: ViTOptions | None = None) -> ViT:
-    """Create the model that a Hugging Face `config.json` describes.
+    """Creates the model that a Hugging Face `config.json` describes.
 
     Args:
         config: Content of the file.
@@ -243,7 +243,7 @@ def model_from_config(config: JsonObject, sizes: ViTOptions | None = None) -> Vi
 
 
 def model_from_tensors(tensors: StateDict, source: str) -> ViT:
-    """Create the model whose sizes are those of DINOv3 or DINOv2 tensors by name.
+    """Creates the model whose sizes are those of DINOv3 or DINOv2 tensors by name.
 
     Raises:
         DataError: The tensors are not those of a DINOv3 or DINOv2 ViT.
@@ -281,14 +281,14 @@ def model_from_tensors(tensors: StateDict, source: str) -> ViT:
 
 
 def image_fields(options: ViTOptions) -> dict[str, object]:
-    """Return the fields of `config.model.image` that describe a backbone."""
+    """Returns the fields of `config.model.image` that describe a backbone."""
     return {n: getattr(options, n) for n in (*_FIELDS.values(), "position_grid")}
 
 
 def to_params(
     model: ViT, tensors: StateDict, source: str = "state dict"
 ) -> MutableCollection:
-    """Convert DINOv3 tensors by name to the parameters of `model`.
+    """Converts DINOv3 tensors by name to the parameters of `model`.
 
     Raises:
         DataError: Tensors are missing, unexpected or of another shape. The message lists up
@@ -312,7 +312,7 @@ def to_params(
 
 
 def to_tensors(model: ViT, params: Collection) -> dict[str, np.ndarray]:
-    """Invert `to_params` and add a mask token of zeros."""
+    """Inverts `to_params` and adds a mask token of zeros."""
     options = model.options
     size = options.patch_size
     patches = dict(params["patch_embed"])

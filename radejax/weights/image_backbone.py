@@ -25,7 +25,7 @@ from radejax.weights.convert import Rules, StateDict
 def load_image_backbone(
     path: PathLike | None, model: RadeNet, embeddings_sha256: str | None = None
 ) -> VariableDict | None:
-    """Load pretrained variables for `radejax.training.step.with_pretrained`.
+    """Loads pretrained variables for `radejax.training.step.with_pretrained`.
 
     Args:
         path: DINOv3 or DINOv2 that `dinov3_hf.load` reads, or ResNet-50 file from
@@ -81,7 +81,7 @@ def load_image_backbone(
 
 
 def check_same_backbone(params: Collection, sha256: str, source: PathLike) -> None:
-    """Raise a `UserError` unless weights have the checksum of a run or of embeddings.
+    """Raises a `UserError` unless weights have the checksum of a run or of embeddings.
 
     Args:
         params: Parameters of an image backbone.
@@ -98,7 +98,7 @@ def check_same_backbone(params: Collection, sha256: str, source: PathLike) -> No
 
 
 def check_fits(model: RadeNet, variables: VariableDict, source: PathLike) -> None:
-    """Raise a `UserError` unless variables fit a model; the backbone may be missing."""
+    """Raises a `UserError` unless variables fit a model; the backbone may be missing."""
     wanted = convert.variable_shapes(model)
     found = convert.shapes_of(variables)
     if IMAGE_BACKBONE not in variables.get("params", {}):
@@ -111,7 +111,7 @@ def check_fits(model: RadeNet, variables: VariableDict, source: PathLike) -> Non
 
 
 def weights_sha256(params: Collection) -> str:
-    """Return the SHA-256 of the names, shapes and float32 values of a tree of weights."""
+    """Returns the SHA-256 of the names, shapes and float32 values of a tree of weights."""
     digest = hashlib.sha256()
     for path, leaf in jax.tree_util.tree_leaves_with_path(params):
         digest.update(f"{jax.tree_util.keystr(path)}{leaf.shape}".encode())
@@ -138,7 +138,7 @@ RESNET_RULES: Rules = (
 def load_resnet(
     state_dict_or_path: StateDict | PathLike, model: RadeNet
 ) -> VariableDict:
-    """Load the variables of DinoRADE's ResNet from torchvision's `resnet50-*.pth`.
+    """Loads the variables of DinoRADE's ResNet from torchvision's `resnet50-*.pth`.
 
     Args:
         state_dict_or_path: File, or its tensors by name.
@@ -164,6 +164,6 @@ def load_resnet(
 
 
 def save_resnet(params: Collection, path: PathLike) -> None:
-    """Write the parameters of a `ResNetTrunk` to a safetensors file with torchvision's names."""
+    """Writes the parameters of a `ResNetTrunk` to a safetensors file with torchvision's names."""
     trunk = {"params": {"image_backbone": params}}
     safetensors.numpy.save_file(convert.to_torch(RESNET_RULES, trunk), path)

@@ -24,7 +24,7 @@ _UNUSED_CBAM = r"(rad_)?backbone\.cbam_"  # official models without CBAM have th
 def read(
     tensors: StateDict, source: str, **model_overrides: object
 ) -> tuple[RadeNetOptions, MutableVariableDict]:
-    """Return the options and the variables of tensors by official name.
+    """Returns the options and the variables of tensors by official name.
 
     The maps include the padding; their grid for official weights is
     `RadarGrid.kradar().padded(8, "stretched")`.
@@ -53,7 +53,7 @@ def read(
 
 
 def save(model: RadeNet, variables: VariableDict) -> dict[str, np.ndarray]:
-    """Return a state dict that the official code can load; this is the inverse of `read`.
+    """Returns a state dict that the official code can load; this is the inverse of `read`.
 
     To write a file, use `safetensors.numpy.save_file(state, path)`, or `torch.save` after
     `torch.from_numpy` of every array.
@@ -99,7 +99,7 @@ def save(model: RadeNet, variables: VariableDict) -> dict[str, np.ndarray]:
 def infer_fields(
     tensors: StateDict, source: str, overrides: Mapping[str, object], prefix: str = ""
 ) -> dict[str, object]:
-    """Infer fields of `config.model` from names and shapes, and apply the overrides.
+    """Infers fields of `config.model` from names and shapes, and applies the overrides.
 
     Args:
         tensors: Tensors by official name.
@@ -157,7 +157,7 @@ def infer_fields(
 
 
 def rules(heads: str, prefix: str = "") -> Rules:
-    """Return the rules from modules of `RadeNet` to official names, for `convert`.
+    """Returns the rules from modules of `RadeNet` to official names, for `convert`.
 
     Args:
         heads: Kind of the heads, "expanded" or "default".
@@ -191,7 +191,7 @@ def rules(heads: str, prefix: str = "") -> Rules:
 
 
 def neck_rules(ours: str, theirs: str) -> Rules:
-    """Return the rules of a plain neck (with `conv`) or dilated one (`conv_1`, `conv_2`)."""
+    """Returns the rules of a plain neck (with `conv`) or dilated one (`conv_1`, `conv_2`)."""
     block = rf"({re.escape(theirs)}\.\d\.(?:conv1\.)?)"
     return (
         (rf"^{ours}/block_(\d)/", lambda m: f"{theirs}.{int(m[1]) - 1}."),
@@ -202,7 +202,7 @@ def neck_rules(ours: str, theirs: str) -> Rules:
 
 
 def torch_shapes(model: RadeNet) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of the official tensors that a model uses, by official name."""
+    """Returns the shapes of the official tensors that a model uses, by official name."""
     names = rules(model.options.heads)
     shapes = {}
     for path, shape in convert.variable_shapes(model).items():

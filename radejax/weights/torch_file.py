@@ -37,7 +37,7 @@ _MAX_DIMS = 16
 
 
 def read(path: PathLike) -> object:
-    """Read the content of a `.pth` file, with tensors as NumPy arrays.
+    """Reads the content of a `.pth` file, with tensors as NumPy arrays.
 
     Args:
         path: File written by `torch.save`: a state dict, or a checkpoint that contains one
@@ -81,7 +81,7 @@ class _Storage(NamedTuple):
 def _rebuild_tensor(
     storage: _Storage, offset: int, shape: Sizes, strides: Sizes, *unused: object
 ) -> np.ndarray:
-    """Return a view of a storage, after checking that it is within the storage."""
+    """Returns a view of a storage, after checking that it is within the storage."""
     if not isinstance(storage, _Storage) or max(len(shape), len(strides)) > _MAX_DIMS:
         raise DataError("a tensor without a storage or of more than 16 axes")
     if any(type(n) is not int or n < 0 for n in (offset, *shape, *strides)):
@@ -101,7 +101,7 @@ def _rebuild_parameter(data: np.ndarray, *unused: object) -> np.ndarray:
 
 
 def _new_dict() -> dict[str | int, object]:
-    """Return a dict for an `OrderedDict`, which later instructions fill."""
+    """Returns a dict for an `OrderedDict`, which later instructions fill."""
     return {}
 
 
@@ -159,7 +159,7 @@ class _Unpickler(pickle._Unpickler):
         return _ALLOWED[module, name]
 
     def persistent_load(self, pid: Any) -> _Storage:
-        """Return the storage of an identifier `("storage", dtype, key, device, size)`."""
+        """Returns the storage of an identifier `("storage", dtype, key, device, size)`."""
         kind, dtype, key, _, size = pid
         if kind != "storage" or dtype not in _DTYPES.values() or type(key) is not str:
             raise DataError("a tensor without a storage of numbers")
@@ -177,7 +177,7 @@ class _Unpickler(pickle._Unpickler):
         return self._storages[key]
 
     def _ignore_state(self) -> None:
-        """Ignore the state of `BUILD`, which is the `_metadata` of a state dict."""
+        """Ignores the state of `BUILD`, which is the `_metadata` of a state dict."""
         self.stack.pop()
 
     def _set_item(self) -> None:
@@ -188,7 +188,7 @@ class _Unpickler(pickle._Unpickler):
         self._update(self.pop_mark())
 
     def _update(self, items: list[object]) -> None:
-        """Check keys before adding them, as hashing nested tuples can take unlimited time."""
+        """Checks keys before adding them, as hashing nested tuples can take unlimited time."""
         target = self.stack[-1]
         keys = items[::2]
         if type(target) is not dict or any(type(k) not in (str, int) for k in keys):

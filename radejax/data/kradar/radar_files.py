@@ -22,7 +22,7 @@ def find_frames(
     sequence_numbers: Sequence[int] | None = None,
     weather: Sequence[str] | None = None,
 ) -> list[pathlib.Path]:
-    """Find radar files in files and folders.
+    """Finds radar files in files and folders.
 
     If a frame has both files, only the projection is returned.
 
@@ -76,7 +76,7 @@ def sequence_folder(path: pathlib.Path) -> pathlib.Path:
 
 
 def key_of(path: pathlib.Path) -> str:
-    """Return the key of the frame of a radar file without the LiDAR index: "5/00033".
+    """Returns the key of the frame of a radar file without the LiDAR index: "5/00033".
 
     Only label files contain the LiDAR index.
     """

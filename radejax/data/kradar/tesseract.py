@@ -48,7 +48,7 @@ VARIABLE = "arrDREA"
 def read_tesseract(
     path: PathLike, *, shape_drea: tuple[int, ...] | None = None
 ) -> Real[np.ndarray, "D R E A"]:
-    """Read a 4D radar tensor as it is stored: linear power, column-major.
+    """Reads a 4D radar tensor as it is stored: linear power, column-major.
 
     Args:
         path: `tesseract_*.mat` with the variable `arrDREA`.
@@ -68,7 +68,7 @@ def read_tesseract(
 def project_file(
     path: PathLike, *, shape_drea: tuple[int, ...] | None = None
 ) -> Float[np.ndarray, "R A DE"]:
-    """Compute `project_tensor` of a file.
+    """Computes `project_tensor` of a file.
 
     Uncompressed floats are streamed: every azimuth is reduced while it is in the cache, and
     the 260 MB are never in memory. (A memory map would save as much, but a bad disk sector
@@ -101,7 +101,7 @@ def project_file(
 def _check_power(
     path: PathLike, elevations: Float[np.ndarray, "R A E"], lowest: float
 ) -> None:
-    """Raise a `DataError` if values cannot be power.
+    """Raises a `DataError` if values cannot be power.
 
     Args:
         path: File of the radar tensor, for the message.
@@ -115,7 +115,7 @@ def _check_power(
 def read_projection_npy(
     path: PathLike, *, projection_shape: tuple[int, ...] | None = None
 ) -> Float[np.ndarray, "R A DE"]:
-    """Read a projection in the order of the released code, or with its channels last.
+    """Reads a projection in the order of the released code, or with its channels last.
 
     Args:
         path: `DERA_tesseract_*.npy`, `[D+E, R, A]` floats. `[R, A, D+E]` is read too if
@@ -146,7 +146,7 @@ def read_projection_npy(
 def _projection_axes(
     path: PathLike, stored: np.ndarray, projection_shape: tuple[int, ...] | None
 ) -> tuple[int, int, int]:
-    """Return the positions of range, azimuth and channels in a stored projection."""
+    """Returns the positions of range, azimuth and channels in a stored projection."""
     if stored.ndim == 3 and stored.dtype.kind == "f":
         if projection_shape in (None, stored.transpose(1, 2, 0).shape):
             return 1, 2, 0
@@ -164,7 +164,7 @@ def _projection_axes(
 
 
 def read_frame(path: PathLike, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
-    """Return the float32 projection of a radar tensor, or of a file of another release.
+    """Returns the float32 projection of a radar tensor, or of a file of another release.
 
     Files of `.npy` contain projections of the reference implementation or, by their names,
     frames of K-Radar's reduced releases (see `radejax.data.kradar.reduced`).
@@ -184,14 +184,14 @@ def read_frame(path: PathLike, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
 
 
 def check_axes(grid: RadarGrid) -> None:
-    """Raise a `UserError` if there are too few bins for mean power and Doppler."""
+    """Raises a `UserError` if there are too few bins for mean power and Doppler."""
     least = min(grid.num_doppler - 1, grid.num_elevation)
     expected = "at least (2, 2, 1, 2): Doppler, range, elevation, azimuth"
     require(least > 0, "shape of the radar's grid", grid.shape_drea, expected)
 
 
 def read_polar(path: PathLike, grid: RadarGrid) -> reduced.Polar:
-    """Return mean power and mean Doppler of all cells, see `radejax.data.kradar.reduced`.
+    """Returns mean power and mean Doppler of all cells, see `radejax.data.kradar.reduced`.
 
     Args:
         path: Radar tensor, or frame of a reduced release.
@@ -215,7 +215,7 @@ def read_polar(path: PathLike, grid: RadarGrid) -> reduced.Polar:
 
 
 def read_power(path: PathLike, grid: RadarGrid) -> Real[np.ndarray, "D R E A"]:
-    """Read the radar tensor of a sensor and check that its values can be linear power.
+    """Reads the radar tensor of a sensor and checks that its values can be linear power.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -228,7 +228,7 @@ def read_power(path: PathLike, grid: RadarGrid) -> Real[np.ndarray, "D R E A"]:
 
 
 def check_frame(path: PathLike, grid: RadarGrid, *, deep: bool = False) -> None:
-    """Raise the errors of `read_frame` that header and size of a file show.
+    """Raises the errors of `read_frame` that header and size of a file show.
 
     With `deep`, the whole file is read, which also detects corrupted values.
     """
@@ -247,7 +247,7 @@ def check_frame(path: PathLike, grid: RadarGrid, *, deep: bool = False) -> None:
 def _opened(
     path: PathLike, shape_drea: tuple[int, ...] | None
 ) -> Iterator[tuple[io.FileIO, Layout]]:
-    """Open a file without buffering and find its tensor.
+    """Opens a file without buffering and finds its tensor.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -271,7 +271,7 @@ def _opened(
 def _read_columns(
     file: io.FileIO, layout: Layout
 ) -> Iterator[Real[np.ndarray, "E R D"]]:
-    """Yield the azimuth columns of a file in order, all in the same buffer."""
+    """Yields the azimuth columns of a file in order, all in the same buffer."""
     slab = np.empty(layout.shape[2::-1], layout.dtype)
     view = slab.data.cast("B")
     file.seek(layout.offset)
@@ -319,7 +319,7 @@ class Layout:
 
 
 def _find_array(file: BinaryIO) -> Layout:
-    """Find type, shape and location of the tensor in a file that is open for reading.
+    """Finds type, shape and location of the tensor in a file that is open for reading.
 
     Raises:
         DataError: The file is not a MATLAB v5 file, is truncated or corrupted, or has no real
@@ -361,7 +361,7 @@ def _find_array(file: BinaryIO) -> Layout:
 
 
 def _read_array(file: BinaryIO, layout: Layout) -> np.ndarray:
-    """Read the values of a variable in the stored type.
+    """Reads the values of a variable in the stored type.
 
     Raises:
         DataError: The values are truncated or do not inflate to the expected size.
@@ -391,7 +391,7 @@ def _read_array(file: BinaryIO, layout: Layout) -> np.ndarray:
 
 
 def _parse(file: BinaryIO, head: bytes) -> tuple[str, Layout | None]:
-    """Return the name of a variable, and its layout if it is the tensor."""
+    """Returns the name of a variable, and its layout if it is the tensor."""
     kind, num_bytes = struct.unpack_from("<II", head)
     flags_kind, flags_size, at, after = _tag(head, 8)
     (flags,) = struct.unpack_from("<I", head, at)
@@ -426,7 +426,7 @@ def _parse(file: BinaryIO, head: bytes) -> tuple[str, Layout | None]:
 
 
 def _tag(head: bytes, at: int) -> tuple[int, int, int, int]:
-    """Return type, size and offset of an element's content, and offset of the next element."""
+    """Returns type, size and offset of an element's content, and offset of the next element."""
     (word,) = struct.unpack_from("<I", head, at)
     if word >> 16:  # small element: up to four bytes within the tag
         return word & 0xFFFF, word >> 16, at + 4, at + 8
