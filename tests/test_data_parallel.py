@@ -93,9 +93,9 @@ def _num_operations(program: Any) -> float:
 @pytest.mark.parametrize(
     ("kind", "num_devices"),
     [
-        ("dinorade", 8),
+        ("radenet", 8),
+        pytest.param("dinorade", 8, marks=pytest.mark.slow),
         pytest.param("dinorade", 2, marks=pytest.mark.slow),
-        pytest.param("radenet", 8, marks=pytest.mark.slow),
         pytest.param("dinorade_not_frozen", 8, marks=pytest.mark.slow),
         pytest.param("dinorade_resnet50", 8, marks=pytest.mark.slow),
     ],

@@ -22,8 +22,13 @@ if TYPE_CHECKING:
 MODEL = pathlib.Path(__file__).with_name("demo_model")
 """Model of the quickstart with seed 0; docs/detector.md lists the commands that made it."""
 
-_workdir = click.option(
-    "--workdir", type=entry.EXISTING, help="Run whose detections are drawn."
+_detections = entry.together(
+    click.option(
+        "--workdir", type=entry.EXISTING, help="Run whose detections are drawn."
+    ),
+    entry.score_threshold(
+        "Their score threshold, or some by class. Default: the run's."
+    ),
 )
 
 
@@ -49,7 +54,7 @@ _workdir = click.option(
     default="narrow",
     help="Region of interest to draw.",
 )
-@_workdir
+@_detections
 @entry.max_frames
 def overlay(
     name: str,
@@ -163,7 +168,7 @@ def _draw(
 @entry.out_file("recording.rrd", "File of the recording.")
 @entry.labelled_frames
 @entry.camera_calibration
-@_workdir
+@_detections
 @entry.max_frames
 def view(
     roots: tuple[str, ...],
@@ -217,7 +222,11 @@ def viewer_scenes(
 
 
 def _open(
-    roots: Sequence[str], config: str | None, workdir: str | None, **part: Any
+    roots: Sequence[str],
+    config: str | None,
+    workdir: str | None,
+    score_threshold: str | None,
+    **part: Any,
 ) -> tuple[LabelledFrames[LabelledFrame], radejax.Detector | None]:
     """Returns the frames to draw, and the detector of a run on such data, or None.
 
@@ -227,8 +236,10 @@ def _open(
     from radejax.data.kradar.reduced import check_release
 
     if workdir is None:
+        if score_threshold is not None:
+            raise UserError("--score-threshold selects detections: give --workdir RUN")
         return entry.read_frames(roots, config, any_visibility=True, **part), None
-    detector = radejax.Detector.from_workdir(workdir)
+    detector = radejax.Detector.from_workdir(workdir, score_threshold=score_threshold)
     settings = detector.saved.config
     is_kradar = find_reader(settings.data.format) is radejax.KRadar
     reader = config if config or is_kradar else settings

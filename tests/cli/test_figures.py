@@ -155,25 +155,31 @@ def test_detections_of_a_run_are_drawn_beside_the_labels(
     grid = KRadar([root]).grid
     found = Boxes.one_frame([[20.0, 0, 0, 4, 2, 1.5, 0]], ["Sedan"], [0.9])
 
+    asked: list[str | None] = []
+
     class Detector:
         takes_camera = False
         decode_options = DecodeOptions(score_threshold=0.25)
         saved = SimpleNamespace(config=Config())
 
-        def __init__(self) -> None:
+        def __init__(self, _: str, score_threshold: str | None) -> None:
             self.grid = grid
+            asked.append(score_threshold)
 
         def __call__(self, *_: object) -> Any:
             return SimpleNamespace(to_boxes=lambda: found)
 
-    monkeypatch.setattr(radejax.Detector, "from_workdir", lambda _: Detector())
-    _run("1", root, "--workdir", root)
+    monkeypatch.setattr(radejax.Detector, "from_workdir", Detector)
+    _run("1", root, "--workdir", root, "--score-threshold", "0.3,Bicycle=0.1")
+    assert asked == ["0.3,Bicycle=0.1"]
     texts = [text.get_text() for text in drawn[0].legends[0].get_texts()]
     assert texts[4] == "false positive (1)"
     assert texts[-1] == "score ≥ 0.25, IoU > 0.3"
     assert "Sedan 0.90" in [text.get_text() for text in drawn[0].axes[0].texts]
     error = _run("1", root, "--workdir", root, "--slices", code=2).stderr
     assert "--slices shows no detections" in error
+    error = _run("1", root, "--score-threshold", 0.3, code=2).stderr
+    assert "--score-threshold selects detections: give --workdir RUN" in error
 
 
 def test_frames_with_projections_only_are_shown(tmp_path: pathlib.Path) -> None:

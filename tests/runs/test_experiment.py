@@ -83,6 +83,7 @@ def test_frames_labels_and_frozen_weights_tell_whether_a_run_is_the_same() -> No
     assert stays(["1/a"], "0" * 64) != stays(["1/a"], "1" * 64)
 
 
+@pytest.mark.slow
 def test_a_run_of_two_frames(
     tmp_path: pathlib.Path,
     monkeypatch: pytest.MonkeyPatch,
