@@ -36,10 +36,8 @@ HEIGHTS_M = {"car": 1.5, "van": 2.0, "truck": 2.5, "bus": 3.0}
 CLASSES = tuple(HEIGHTS_M)
 PIXEL_M = 0.173611  # a range bin of the radar images, and a pixel of the labels
 SHAPE = 576, 400  # ranges, and azimuths clockwise from ahead
-MERGED = (
-    4,
-    2,
-)  # of them are one bin, by the maximum; the antenna's beam is 1.8 degrees wide
+# Of them, these are one bin, by the maximum; the antenna's beam is 1.8 degrees wide.
+MERGED = 4, 2
 BINS = SHAPE[0] // MERGED[0], SHAPE[1] // MERGED[1]
 CAMERA_DELAY_S = 0.25  # of the radar images, as in the SDK
 GRID = RadarGrid(

@@ -19,6 +19,7 @@ import json
 import logging
 import math
 import pathlib
+import threading
 import time
 from collections.abc import Generator, Mapping, Sequence
 
@@ -38,6 +39,9 @@ _log = logging.getLogger(__name__)
 
 _MAX_LISTED = 20
 _SMALL_JOB_BINS = 3e9  # about 50 of K-Radar's tensors, a few seconds
+# In CPython before 3.11.8, NumPy cannot parse the headers of files in several threads: this
+# fails now and then with "AST constructor recursion depth mismatch" (its issue 106905).
+_HEADER = threading.Lock()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -152,12 +156,17 @@ class Records:
         """
         path = self.path(key)
         expected = f"a {self.dtype} array of shape {self.shape}"
-        with wrap_read_errors(path, f"{expected}; delete it and write it again"):
-            with open(path, "rb") as file:
-                array = np.lib.format.read_array(file, allow_pickle=False)
-            if array.shape != self.shape or array.dtype.name != self.dtype:
-                raise ValueError(f"{array.dtype} array of shape {array.shape}")
-            return array
+        with (
+            wrap_read_errors(path, f"{expected}; delete it and write it again"),
+            open(path, "rb") as file,
+        ):
+            with _HEADER:
+                np.lib.format.read_magic(file)
+                shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(file)
+            if shape != self.shape or dtype.name != self.dtype:
+                raise ValueError(f"{dtype} array of shape {shape}")
+            array = np.fromfile(file, dtype, math.prod(shape))
+            return array.reshape(shape, order="F" if is_fortran else "C")
 
     def write(
         self,

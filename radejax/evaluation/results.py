@@ -173,8 +173,16 @@ class ReportOptions(EvaluationOptions):
 
 
 SAME_NUMBERS = frozenset(
-    ["bootstrap", "batch_size", "num_visualizations", "figures", "plots", "kitti"]
-).union(["wanted_precision"])
+    [
+        "batch_size",
+        "bootstrap",
+        "figures",
+        "kitti",
+        "num_visualizations",
+        "plots",
+        "wanted_precision",
+    ]
+)
 """Options of an evaluation that do not change its APs."""
 
 

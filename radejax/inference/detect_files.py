@@ -199,9 +199,8 @@ def find_inputs(
     config = detector.saved.config
     labels = labels or config.data.labels
     camera_calibration = camera_calibration or config.data.camera_calibration
-    if (
-        find_reader(config.data.format) is KRadar
-    ):  # a derived reader may read frames in another way
+    # A derived reader may read frames in another way.
+    if find_reader(config.data.format) is KRadar:
         found = find_frames(paths, sequence_numbers, weather)
         return _of_files(found, paths, detector, labels, camera_calibration)
     options = config.data.replace(

@@ -204,10 +204,8 @@ class SimulationOptions(Options, section="config.simulation"):
             is_one = self.vru_density_scale == 1
             self._require(is_one, "vru_density_scale", "1 for scenes of real labels")
         if self.is_own:
-            is_whole = self.frames_per_sequence in (
-                0,
-                20,
-            )  # the default is that of others
+            # All frames are simulated, and the default is that of other scenes.
+            is_whole = self.frames_per_sequence in (0, 20)
             all_frames = "0, all frames of a CSV file"
             self._require(is_whole, "frames_per_sequence", all_frames)
         self.make_grid()

@@ -1,5 +1,6 @@
 """Records: one file per frame, resumable, sharded, never half written."""
 
+import concurrent.futures
 import dataclasses
 import errno
 import json
@@ -77,6 +78,20 @@ def test_every_frame_is_its_projection(data, folder):
         assert records[frame.key].dtype == np.float16
     with pytest.raises(FileNotFoundError):
         records["1/none"]
+
+
+def test_threads_read_at_the_same_time(tmp_path):
+    """NumPy's parser of headers fails now and then in threads of Python 3.11.7."""
+    np.save(tmp_path / "1.npy", np.ones((4, 2), np.float16))
+    records = Records(tmp_path, (4, 2), "float16", {})
+    interval_s = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with concurrent.futures.ThreadPoolExecutor(8) as pool:
+            found = list(pool.map(records.__getitem__, ["1"] * 4000))
+    finally:
+        sys.setswitchinterval(interval_s)
+    assert all((array == 1).all() for array in found)
 
 
 def test_corrupted_records_are_named(data, copy):

@@ -124,12 +124,14 @@ def test_scores_during_training_name_their_protocol(setup):
     names = ("focal", "gwd", "weighted_sum")
 
     @jax.jit
-    def terms_of(batch):
-        maps = setup.model.apply(setup.variables, *batch.model_inputs(), train=False)
+    def terms_of(variables, batch):
+        maps = setup.model.apply(variables, *batch.model_inputs(), train=False)
         terms = detection_loss(maps, batch, grid, setup.config.loss)[1]
         return jnp.stack([terms[name] for name in names])
 
-    expected = [terms_of(batch) for batch in make_loader(table, one_by_one)]
+    expected = [
+        terms_of(setup.variables, batch) for batch in make_loader(table, one_by_one)
+    ]
     found = [alone.values[f"test/{name}"] for name in names]
     np.testing.assert_allclose(found, np.mean(expected, 0), rtol=1e-4)
     assert alone.values["test/loss"] == pytest.approx(4.0)
