@@ -141,17 +141,18 @@ def check(
 
     Example: radejax data check /disk1/kradar /disk2/kradar
     """
-    from radejax.data import check as checks
+    from radejax.data.check import check_frames
+    from radejax.data.kradar import check as kradar_check
     from radejax.data.options import DataOptions
 
     how = {"deep": deep, "progress": not as_json}
     if config is None:
         options["version"] = options["version"] or DataOptions().label_version
-        report = checks.check_dataset(roots, **how, **options)
+        report = kradar_check.check_dataset(roots, **how, **options)
     else:
         frames = entry.read_frames(roots, config, **options)
         classes = radejax.load_config(config).classes
-        report = checks.check_frames(frames, classes, roots, **how)
+        report = check_frames(frames, classes, roots, **how)
     entry.echo_result(as_json, report.to_dict(), report.to_text())
     if report.num_problems:
         raise SystemExit(entry.FAILED)

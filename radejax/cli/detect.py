@@ -147,8 +147,9 @@ def detect(
 @click.option(
     "--int8",
     is_flag=True,
-    help="Compute convolutions in int8 (onnx only). Frames of the train split calibrate "
-    "it, and those of the test split give the APs in the README of the folder.",
+    help="Compute convolutions in int8 (onnx only). Frames of the validation split, or else "
+    "of the train split, calibrate it, and those of the test split give the APs in the "
+    "README of the folder.",
 )
 @entry.several("--data", "roots", help="Roots for --int8. Default: those of the run.")
 @click.option(

@@ -115,7 +115,11 @@ class Records:
         require(dtype in ENCODINGS, "dtype", dtype, f"one of {', '.join(ENCODINGS)}")
         options = {"shape": list(shape), "dtype": dtype, "source": source}
         manifest.Manifest.claim(
-            folder, "records", options, (), ["*.npy"], " (--records, or --out)"
+            folder,
+            "records",
+            options,
+            patterns=["*.npy"],
+            option=" (--records, or --out)",
         )
         return cls.open(folder)
 

@@ -218,7 +218,7 @@ def test_simulate_works_anywhere(
 def test_roots_are_separate_repeated_or_with_commas(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from radejax.data import check
+    from radejax.data.kradar import check
 
     names = ("a", "b", "c", "d,e")
     for name in names:
@@ -238,7 +238,7 @@ def test_roots_are_separate_repeated_or_with_commas(
 def test_a_part_of_the_data_is_chosen(
     monkeypatch: pytest.MonkeyPatch, tmp_path: pathlib.Path
 ) -> None:
-    from radejax.data import check
+    from radejax.data.kradar import check
 
     seen = []
 

@@ -8,10 +8,10 @@ import pytest
 
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
-from radejax.data import check
-from radejax.data.check import HealthReport, check_dataset
+from radejax.data.check import HealthReport
 from radejax.data.dataset import Summary
-from radejax.data.kradar import KRadar, write
+from radejax.data.kradar import KRadar, check, write
+from radejax.data.kradar.check import check_dataset
 from radejax.data.kradar.labels import Label
 
 SEDAN = "expected about 4.61 x 2.18 x 1.91 m"
