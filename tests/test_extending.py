@@ -21,9 +21,10 @@ from radejax import models
 from radejax.cli.main import main
 from radejax.config import Config
 from radejax.core.errors import UserError
-from radejax.data.check import check_dataset, check_frames
+from radejax.data.check import check_frames
 from radejax.data.dataset import LabelledFrames, find_reader
 from radejax.data.kradar import KRadar
+from radejax.data.kradar.check import check_dataset
 from radejax.data.options import DataOptions
 from radejax.data.points import cfar_points, percentile_points
 from radejax.data.projection import project_tensor

@@ -17,8 +17,8 @@ from radejax import Detector, models
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
 from radejax.data.cameras import CameraOptions, camera_inputs
-from radejax.data.check import check_dataset
 from radejax.data.kradar import KRadar, read_labels
+from radejax.data.kradar.check import check_dataset
 from radejax.data.kradar.tesseract import read_tesseract
 from radejax.data.projection import project_tensor
 from radejax.inference.saved import SavedModel

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import UserError
-from radejax.data.check import check_dataset
 from radejax.data.kradar import KRadar, write
+from radejax.data.kradar.check import check_dataset
 from radejax.data.kradar.folders import is_elevation_axis_up
 from radejax.data.kradar.reduce import reduce_dataset
 from radejax.data.kradar.reduced import project_reduced, reduce_tensor, strongest_points
