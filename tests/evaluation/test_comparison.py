@@ -1,4 +1,5 @@
 import json
+import pathlib
 
 import numpy as np
 import pytest
@@ -26,6 +27,7 @@ from radejax.evaluation.results import (
 
 from .scenes import random_scene
 
+ROOT = pathlib.Path(__file__).resolve().parents[2]
 CLASSES = ("Sedan", "Bus or Truck")
 TRUTH, FOUND, FRAMES = random_scene(1, num_frames=60, num_objects=200, ties=False)
 
@@ -151,6 +153,23 @@ def test_at_most_5_percent_of_equal_configs_differ(of_seeds, is_paired):
     assert np.mean([one.low <= 0 <= one.high for one in found]) >= 0.936
     assert np.mean(p_values < 0.01) <= 0.02
     assert np.mean(p_values < 0.5) > 0.2  # it can find differences
+
+
+def test_the_rates_in_the_explanation_are_these():
+    page = (ROOT / "docs" / "statistics.md").read_text(encoding="utf-8")
+    for num_sequences in (3, 5, 12, 50):
+        rng = np.random.default_rng(0)
+        pairs = [drawn_aps(rng, 0.0, 1, num_sequences, 400) for _ in range(1000)]
+        found = [difference(*pair, True, num_sequences) for pair in pairs]
+        wrong = np.mean([not one.low <= 0 <= one.high for one in found])
+        assert f"| {num_sequences} | {100 * wrong:.0f} % |" in page
+    for of_seeds in (0.0, 0.3, 3.0):
+        rng = np.random.default_rng(0)
+        pairs = [drawn_aps(rng, of_seeds) for _ in range(1000)]
+        single = [difference(a[:1], b[:1], True, 12).p_value for a, b in pairs]
+        three = [difference(a, b, True, 12).p_value for a, b in pairs]
+        rates = [f"{100 * np.mean(np.array(x) < 0.05):.1f} %" for x in (single, three)]
+        assert f"| {of_seeds:g} | {rates[0]} | {rates[1]} |" in page
 
 
 def test_a_gain_has_its_deviation_and_is_paired_by_seed():
