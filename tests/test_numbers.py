@@ -78,6 +78,15 @@ def _robustness_rows() -> Iterator[str]:
         yield f"{field} {_row(aps)}"
 
 
+def _calibration_rows() -> Iterator[str]:
+    """Lowest score, calibration errors of score and probability, ratio and its interval."""
+    stored = json.loads((REPORTS / "calibration.json").read_text())
+    for row in stored["calibration_errors"]:
+        low, high = row["ratio_interval"]
+        errors = f"{row['score']:.3f} {row['probability']:.3f}"
+        yield f"{row['min_score']} {errors} {row['ratio']:.2f} {low:.2f} {high:.2f}"
+
+
 def _row(aps: Iterable[float]) -> str:
     return " ".join(f"{ap:.1f}" for ap in aps)
 
@@ -97,7 +106,7 @@ def stored() -> set[str]:
     """Rows, differences and times as the pages print them."""
     published = ROOT / "radejax" / "evaluation" / "published.csv"
     found = {*APS_OF_PAPERS.findall(published.read_text(encoding="utf-8"))}
-    found |= {*_realistic_rows(), *_robustness_rows()}
+    found |= {*_realistic_rows(), *_robustness_rows(), *_calibration_rows()}
     for path in REPORTS.rglob("*.json"):
         for part in _objects(json.loads(path.read_text(encoding="utf-8"))):
             if {"difference", "low", "high"} <= part.keys():
