@@ -4,7 +4,7 @@
     python evaluate.py --workdir runs/radenet --data /other/kradar
 
 `radejax score` evaluates predictions in files, and `radejax compare` compares results.
-docs/evaluation.md explains every metric.
+docs/protocols.md defines every metric.
 """
 
 from radejax.cli.evaluate import evaluate
