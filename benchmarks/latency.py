@@ -5,7 +5,7 @@
 
 Exports the model, runs frames of the test split one by one in `radejax.Detector`, in `load.py` with
 StableHLO, and in ONNX Runtime with float32 and int8 and several numbers of threads. Writes
-`docs/reports/latency.json` and the table of `docs/deploy.md`. Calls follow each other without a
+`docs/reports/latency.json` and the table of `docs/exports.md`. Calls follow each other without a
 pause, so that other processes on the machine count.
 """
 
@@ -32,7 +32,7 @@ from radejax.runs.quantize import export_int8
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 RESULT = ROOT / "docs" / "reports" / "latency.json"
-PAGE = ROOT / "docs" / "deploy.md"
+PAGE = ROOT / "docs" / "exports.md"
 BEGIN, END = "<!-- table: benchmarks/latency.py -->", "<!-- end of table -->"
 NUM_FRAMES = 64
 

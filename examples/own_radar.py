@@ -5,7 +5,7 @@
 The radar has no elevation, and its beams are uniform in sin(azimuth). The folder has the files
 `radar/DRIVE_FRAME.npy`, linear power `[range, azimuth, Doppler]`, and `boxes.csv` with boxes in a
 vehicle frame; if it is missing, the command simulates such a recording. It draws one frame, trains
-and evaluates in about three minutes on two cores. `docs/extending.md` explains this file.
+and evaluates in about three minutes on two cores. `docs/own_radar.md` explains this file.
 """
 
 from __future__ import annotations

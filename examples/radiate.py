@@ -4,7 +4,7 @@
 
 The folder has the sequences of RADIATE (Sheeny et al., ICRA 2021, arXiv:2010.09076) in the files of
 its SDK, github.com/marcelsheeny/radiate_sdk, whose sample `tiny_foggy` has 18 frames. The command
-draws one frame, trains and evaluates. `docs/extending.md` explains readers and has the results.
+draws one frame, trains and evaluates. `docs/own_radar.md` explains readers and has the results.
 """
 
 from __future__ import annotations

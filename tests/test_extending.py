@@ -1,4 +1,4 @@
-"""Every code block of docs/extending.md is run as it is."""
+"""The code blocks of docs/extending.md and docs/own_radar.md are run as they are."""
 
 import importlib
 import json
@@ -41,8 +41,16 @@ from . import small_models as small
 from . import toy_reader
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
-PAGE = ROOT / "docs" / "extending.md"
-BLOCKS = re.findall(r"^```python\n(.*?)^```", PAGE.read_text(), re.MULTILINE | re.S)
+BLOCKS = re.findall(
+    r"^```python\n(.*?)^```",
+    (ROOT / "docs" / "extending.md").read_text(encoding="utf-8"),
+    re.MULTILINE | re.S,
+)
+RADAR_BLOCKS = re.findall(
+    r"^```py\n(.*?)^```",
+    (ROOT / "docs" / "own_radar.md").read_text(encoding="utf-8"),
+    re.MULTILINE | re.S,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -228,7 +236,7 @@ def test_commands_read_such_data_by_the_config(
         "cfar": cfar_points(projection, grid, threshold_db=0.0),
         "percentile": percentile_points(projection, grid, 0.02),
     }
-    (block,) = re.findall(r"^```py\n(points = .*?)^```", PAGE.read_text(), re.M | re.S)
+    (block,) = (block for block in RADAR_BLOCKS if block.startswith("points = "))
     names = {"frame": _read_toy(root)[1], "GRID": grid}
     exec(f"from radejax.data.points import *\n{block}", names)
     found = percentile_points(projection, grid, 0.01)
@@ -335,8 +343,7 @@ def test_written_folders_are_read(
     is_flat: bool, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also those of a radar that measures only range and azimuth, with one bin per axis."""
-    text = PAGE.read_text(encoding="utf-8")
-    written, *_ = re.findall(r"^```py\n(.*?)^```", text, re.MULTILINE | re.S)
+    (written,) = (block for block in RADAR_BLOCKS if "write_splits" in block)
     if is_flat:
         written, count = re.subn(
             r"(elevation_rad|doppler_mps)=.*", r"\1=[0.0],", written

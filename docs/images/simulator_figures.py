@@ -1,4 +1,4 @@
-"""Draws the figures of `docs/simulator.md`.
+"""Draws the figures of `docs/simulated_radar.md`.
 
 They show full-size maps of each kind of weather, and statistics of the simulated radar and of
 K-Radar's public map.
@@ -40,7 +40,7 @@ REAL_PROFILE_DB = {
     (0, 1): 12.4, (1, 5): 4.4, (5, 10): -3.2, (10, 25): -0.7, (25, 50): 0.0, (50, 75): 0.0,
     (75, 100): 0.0, (107, 114): -4.1, (114, 119): 1.1,
 }  # fmt: skip
-"""Bands in m and medians of K-Radar's public map, as in the table of `docs/simulator.md`."""
+"""Bands in m and medians of K-Radar's public map, as in the table of `docs/simulated_radar.md`."""
 REAL_LEAKAGE_DB = -15.5
 UNSEEN = {"color": "#E69F00", "lw": 1.2, "ls": (0, (3, 1))}
 

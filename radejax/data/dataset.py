@@ -2,7 +2,7 @@
 
 A reader of a format is a class that is derived from `LabelledFrames`, with frames that are
 derived from `LabelledFrame`. `radejax.data.kradar` is the reader of K-Radar;
-docs/extending.md shows another one.
+docs/own_radar.md shows another one.
 """
 
 from __future__ import annotations

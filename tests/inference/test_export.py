@@ -518,8 +518,8 @@ def test_a_program_in_bfloat16_is_lowered_for_accelerators(tmp_path):
 
 
 def _documented(part):
-    """Return the code block of docs/deploy.md that contains a text."""
-    page = pathlib.Path(__file__).parents[2] / "docs" / "deploy.md"
+    """Return the code block of docs/exports.md that contains a text."""
+    page = pathlib.Path(__file__).parents[2] / "docs" / "exports.md"
     blocks = page.read_text(encoding="utf-8").split("```python\n")[1:]
     (code,) = (code for block in blocks if part in (code := block.split("```")[0]))
     return code

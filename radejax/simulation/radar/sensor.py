@@ -1,7 +1,7 @@
 """Imperfections of the radar sensor: noise over range, high-pass filter, array errors.
 
 An ideal sensor has none of them. Their sizes follow one published map of a real K-Radar frame
-and the power of its objects (see `docs/simulator.md`).
+and the power of its objects (see `docs/simulated_radar.md`).
 
 - The direct leak from transmitter to receiver does not move, so it is in the first range bins
   and the Doppler bin of velocity 0. It wraps around to the last range bins.
