@@ -3,10 +3,11 @@
     pip install -e '.[docs]' && mkdocs build --strict
     python docs/site_pages.py site
 
-README, CHANGELOG, CONTRIBUTING and the notebooks keep their places in the repository. The
-reference is generated: a page per package of `radejax/` from its docstrings, a page of all
-commands from their options, and a page of all config fields from the classes of options.
-The second command lists the public names that a built site lacks, and fails if there are any.
+README, CHANGELOG, CONTRIBUTING, the notebooks and the examples keep their places in the
+repository. The reference is generated: a page per package of `radejax/` from its docstrings, a page
+of all commands from their options, and a page of all config fields from the classes of options.
+The second command lists the public names that a built site lacks, and fails if there are any. The
+file is also a hook of mkdocs, which replaces links to modules, notebooks and examples.
 """
 
 import ast
@@ -239,6 +240,33 @@ def root_page(name: str) -> str:
     return re.sub(r"(!?)\[([^\]]*)\]\(([^)\s]+)\)", convert, text)
 
 
+def place_on_site(path: str) -> str:
+    """Page of the site for a file of the repository outside of docs/."""
+    folder, _, name = path.partition("/")
+    if folder == "radejax":
+        module = path.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+        return f"reference/{module.split('.')[1]}.md#{module}"
+    if folder == "examples":
+        return example_page(name)
+    return HOME.get(path, path)
+
+
+def example_page(name: str) -> str:
+    """Page of a file of examples/."""
+    return f"examples/{name.partition('.')[0]}.md"
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Replaces links of a page of docs/ to files outside of docs/; called by mkdocs."""
+    if "/" in page.file.src_uri:
+        return markdown
+    return re.sub(
+        r"\]\(\.\./([^)\s]+)\)",
+        lambda match: f"]({place_on_site(match[1])})",
+        markdown,
+    )
+
+
 def public_names() -> Iterator[str]:
     """Every public function, class and method of the public modules, dotted."""
     for module, path in modules().items():
@@ -271,6 +299,11 @@ def write() -> None:
     for notebook in sorted((ROOT / "notebooks").glob("*.ipynb")):
         with mkdocs_gen_files.open(f"notebooks/{notebook.name}", "wb") as file:
             file.write(notebook.read_bytes())
+    for path in sorted((ROOT / "examples").glob("*.*")):
+        language = {".py": "python", ".sh": "bash"}[path.suffix]
+        text = f"# {path.name}\n\n````{language}\n{path.read_text('utf-8')}````\n"
+        with mkdocs_gen_files.open(example_page(path.name), "w", encoding="utf-8") as file:
+            file.write(text)
     for page, text in reference().items():
         with mkdocs_gen_files.open(page, "w", encoding="utf-8") as file:
             file.write(text)

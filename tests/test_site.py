@@ -5,6 +5,8 @@ import re
 import runpy
 from types import SimpleNamespace
 
+import pytest
+
 from radejax.config import load_config
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
@@ -45,3 +47,26 @@ def test_every_config_field_is_in_the_reference() -> None:
     assert "| `decode.nms_iou` | float from 0 to 1 | `0.3` | NMS removes" in text
     assert "| `model.widths` | tuple of 1 or more int from 1 to 65536 |" in text
     assert "| `loss.assignment` | `center` | `center` | `nms` |" in text  # presets
+
+
+@pytest.mark.parametrize("folder", ["examples", "notebooks"])
+def test_the_gallery_lists_every_example(folder: str) -> None:
+    text = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
+    index = text.partition("## By purpose")[2]
+    listed = re.findall(rf"\]\(\.\./{folder}/([^)]+)\)", index)
+    files = [x.name for x in (ROOT / folder).glob("*.*") if x.suffix != ".pyc"]
+    assert sorted(listed) == sorted(files)
+
+
+def test_links_outside_of_docs_lead_to_pages_of_the_site() -> None:
+    page = SimpleNamespace(file=SimpleNamespace(src_uri="how_it_works.md"))
+    links = {
+        "../radejax/losses/gwd.py": "reference/losses.md#radejax.losses.gwd",
+        "../radejax/models/__init__.py": "reference/models.md#radejax.models",
+        "../examples/slurm.sh": "examples/slurm.md",
+        "../notebooks/04_your_kradar.ipynb": "notebooks/04_your_kradar.ipynb",
+        "../README.md": "index.md",
+        "data.md#records": "data.md#records",
+    }
+    for link, expected in links.items():
+        assert pages.on_page_markdown(f"[x]({link})", page) == f"[x]({expected})"

@@ -20,6 +20,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 sys.path.append(str(ROOT / "examples"))
 
 import detection_figures  # noqa: E402
+import gallery  # noqa: E402
 import networks  # noqa: E402
 import result_figures  # noqa: E402
 import simulator_figures  # noqa: E402
@@ -41,6 +42,7 @@ FIGURES: dict[str, Callable[[pathlib.Path, pathlib.Path], None]] = {
         data, out / "reference_points.png"
     ),
     "simulator": lambda data, out: simulator_figures.draw(out),
+    "gallery": lambda data, out: gallery.draw(data, out / "gallery"),
 }
 
 FOLDER = click.Path(file_okay=False, path_type=pathlib.Path)
