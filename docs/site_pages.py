@@ -198,7 +198,7 @@ def presets_text() -> str:
             rows.append(table_row([f"`{field}`", code(value), *map(code, values)]))
     text = (
         "Fields whose values in these configs are not the defaults. "
-        "[Differences](../deviations.md) explains where the paper and the released code "
+        "[Differences](../deviations.md) explains where the paper and the authors' code "
         "disagree."
     )
     return "\n\n".join(["## Presets", text, "\n".join(rows)])
@@ -302,7 +302,9 @@ def write() -> None:
     for path in sorted((ROOT / "examples").glob("*.*")):
         language = {".py": "python", ".sh": "bash"}[path.suffix]
         text = f"# {path.name}\n\n````{language}\n{path.read_text('utf-8')}````\n"
-        with mkdocs_gen_files.open(example_page(path.name), "w", encoding="utf-8") as file:
+        with mkdocs_gen_files.open(
+            example_page(path.name), "w", encoding="utf-8"
+        ) as file:
             file.write(text)
     for page, text in reference().items():
         with mkdocs_gen_files.open(page, "w", encoding="utf-8") as file:

@@ -8,6 +8,7 @@ import pytest
 PAGE = pathlib.Path(__file__).resolve().parents[1] / "docs" / "jax_for_pytorch.md"
 
 
+@pytest.mark.slow
 def test_the_blocks_run(capsys: pytest.CaptureFixture[str]) -> None:
     blocks = re.findall(r"^```python\n(.*?)^```", PAGE.read_text("utf-8"), re.M | re.S)
     assert len(blocks) >= 6

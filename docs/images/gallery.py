@@ -65,7 +65,9 @@ def draw(data: pathlib.Path, out: pathlib.Path) -> None:
 def _figure_of_cell(notebook: str, cell: int) -> Image.Image:
     path = ROOT / "notebooks" / f"{notebook}.ipynb"
     outputs = json.loads(path.read_text(encoding="utf-8"))["cells"][cell]["outputs"]
-    (png,) = (x["data"]["image/png"] for x in outputs if "image/png" in x.get("data", ()))
+    (png,) = (
+        x["data"]["image/png"] for x in outputs if "image/png" in x.get("data", ())
+    )
     return Image.open(io.BytesIO(base64.b64decode(png)))
 
 
@@ -86,11 +88,16 @@ def _stored(name: str) -> dict:
 def draw_calibration(_: pathlib.Path) -> Figure:
     """Draw the calibration error of scores and of probabilities by class."""
     rows = _stored("calibration.json")["calibration_errors"]
-    rows = [row for row in rows if row["min_score"] == min(r["min_score"] for r in rows)]
+    rows = [
+        row for row in rows if row["min_score"] == min(r["min_score"] for r in rows)
+    ]
     figure = new_figure(4.0, 2.5, layout="constrained")
     ax = figure.subplots()
     place = np.arange(len(rows))
-    for shift, kind, color in ((-0.2, "score", INCONCLUSIVE), (0.2, "probability", SUPPORTED)):
+    for shift, kind, color in (
+        (-0.2, "score", INCONCLUSIVE),
+        (0.2, "probability", SUPPORTED),
+    ):
         ax.barh(place + shift, [r[kind] for r in rows], 0.38, color=color, label=kind)
     ax.set_yticks(place, [row["cls"] for row in rows])
     ax.invert_yaxis()
@@ -140,7 +147,12 @@ def draw_cfar(data: pathlib.Path) -> Figure:
     found = cfar_baseline.detect(projection, frames.grid, parameters)
     boxes = radejax.Boxes.one_frame(found["box"], found["cls"], found["score"])
     scene = radejax.frame_scene(
-        frame, projection, frames.grid, predictions=boxes, score_threshold=0.5, roi="wide"
+        frame,
+        projection,
+        frames.grid,
+        predictions=boxes,
+        score_threshold=0.5,
+        roi="wide",
     )
     return draw_bev(scene).figure
 

@@ -68,7 +68,7 @@ def detect(
         grid: Grid of the model's maps, see `models.map_grid`.
         options: Options of the decoding.
         variables: Variables of the model.
-        frames: Projections as they are stored, or tesseracts in linear power.
+        frames: Projections as they are stored, or radar tensors in linear power.
         image: Images for a radar-camera model, or None to use the radar only.
         camera: Cameras of the images, or None without images.
         settings: Values that replace those in `options`; they may be traced.
@@ -271,7 +271,7 @@ class Detector:
         """Detects the objects in one or more frames.
 
         Args:
-            frames: Projections `[B, R, A, D+E]` or tesseracts `[B, D, R, E, A]` in linear
+            frames: Projections `[B, R, A, D+E]` or radar tensors `[B, D, R, E, A]` in linear
                 power; a single frame without the axis B, which may also be of a reduced
                 release, `[2, R, A, E]` or `[N, 11]`; the path of a file; or a list of
                 such frames and paths. Alternatively a `Batch`, whose image and camera are
@@ -453,7 +453,7 @@ class Detector:
         """Compiles the model, so that the first call is fast.
 
         Args:
-            sample: Frames like those of later calls, such as one tesseract; or the batch
+            sample: Frames like those of later calls, such as one radar tensor; or the batch
                 size of projections (and images, for a radar-camera model).
             image: Images like those of later calls.
             camera: Calibrations like those of later calls.

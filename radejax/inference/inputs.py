@@ -118,9 +118,9 @@ class InputReader:
             )
         raise UserError(
             f"frames have shape {list(shape)}; expected projections [{axes}, R, A, D+E] = "
-            f"[{axes}, {', '.join(map(str, projection))}] or tesseracts [{axes}, D, R, E, "
-            f"A] = [{axes}, {', '.join(map(str, tensor))}], or single frames [2, R, A, E] "
-            f"or [N, 11] of a reduced release{hint}"
+            f"[{axes}, {', '.join(map(str, projection))}] or radar tensors [{axes}, D, R, "
+            f"E, A] = [{axes}, {', '.join(map(str, tensor))}], or single frames [2, R, A, "
+            f"E] or [N, 11] of a reduced release{hint}"
         )
 
     def _read_file(self, path: pathlib.Path, _: int) -> Real[np.ndarray, "..."]:
