@@ -17,6 +17,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import hashlib
 import json
 import logging
 import operator
@@ -69,6 +70,34 @@ def read_sources(folder: pathlib.Path) -> dict[str, State | None]:
                 lines.append((time_ns, name, state))
     lines.sort(key=operator.itemgetter(0))
     return {name: state for _, name, state in lines}
+
+
+def checksums(folder: pathlib.Path, *names: str) -> dict[str, str]:
+    """Returns the sha256 of those files of a folder that are there, by their names."""
+    there = [name for name in names if (folder / name).is_file()]
+    return {x: hashlib.sha256((folder / x).read_bytes()).hexdigest() for x in there}
+
+
+def read_checked(path: pathlib.Path, *keys: str) -> JsonObject:
+    """Reads a JSON object, and checks the files whose checksums are its field "sha256".
+
+    Files that are missing, and objects without this field, are not checked.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        DataError: The file does not contain an object with the given keys. Or another file
+            of the folder is not the one that was written with it.
+    """
+    content = files.read_object(path, *keys)
+    stored = content.get("sha256", {})
+    for name, sha256 in checksums(path.parent, *stored).items():
+        if sha256 != stored[name]:
+            raise DataError(
+                f"{files.relative(path.parent)} is mixed of several results, or corrupted: "
+                f"the sha256 of {name} differs from the one in {path.name}; copy the whole "
+                "folder, or make the results again"
+            )
+    return content
 
 
 def warn_of_changes(

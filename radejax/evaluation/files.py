@@ -17,7 +17,7 @@ from radejax.core import files
 from radejax.core.archives import read_npz, wrap_read_errors
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import JsonObject, PathLike
-from radejax.core.manifest import FILE, Manifest
+from radejax.core.manifest import FILE, Manifest, read_checked
 from radejax.core.options import Options, as_tuples
 from radejax.core.structures import BOX_FIELDS, Boxes, frame_key
 from radejax.data.kradar import KRadar
@@ -255,6 +255,8 @@ def _load_ground_truth(
         truth = files.as_path(source.ground_truth)
         of_report = (truth / "ground_truth.npz", truth / "evaluation/ground_truth.npz")
         truth = next((place for place in of_report if place.is_file()), truth)
+        if (report := truth.with_name("metrics.json")).is_file():
+            read_checked(report)
         table = truth.with_name("frames.json")
         frames = _read_frames(table) if table.is_file() else None
         return read_table(truth, frames, scored=False), frames, {}

@@ -32,7 +32,7 @@ import numpy as np
 from jaxtyping import Shaped
 from tabulate import LATEX_ESCAPE_RULES, tabulate
 
-from radejax.core import files
+from radejax.core import files, manifest
 from radejax.core.files import JsonObject, PathLike
 from radejax.core.version import __version__, radejax_commit
 from radejax.data.kradar.conditions import WEATHERS
@@ -55,6 +55,9 @@ if TYPE_CHECKING:
 
 STALE = ("kitti", "precision_recall_*", "reliability.*", "thresholds.*")
 """Patterns of the names of what only some reports contain."""
+
+INPUTS = ("frames.json", "ground_truth.npz", "predictions.npz")
+"""Names of the files from which a report can be made again."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -162,7 +165,6 @@ def write_report(
     with files.swapped_in(out_dir, *STALE) as folder:
         # The inputs are stored with the report, so that reports can be compared later.
         columns = {name: np.asarray(column).tolist() for name, column in frames.items()}
-        files.write_json(folder / "metrics.json", metrics)
         files.write_json(folder / "frames.json", columns)
         files.write_text(folder / "report.txt", text)
         write_tables(folder / "tables", built, is_simulated=data.is_simulated)
@@ -176,6 +178,8 @@ def write_report(
         # The stored predictions have repaired sizes, so that they can be evaluated again.
         write_boxes(folder / "predictions.npz", data.predictions, frames)
         write_boxes(folder / "ground_truth.npz", data.ground_truth, frames)
+        metrics["sha256"] = manifest.checksums(folder, *INPUTS)
+        files.write_json(folder / "metrics.json", metrics)
         if options.kitti:
             least = options.settings_of("kradar_r40")["score_threshold"]
             write_kitti(

@@ -29,6 +29,7 @@ from radejax.config import Config
 from radejax.core import files
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import JsonObject, PathLike
+from radejax.core.manifest import read_checked
 from radejax.core.options import class_thresholds
 from radejax.core.version import __version__, radejax_commit
 from radejax.data.kradar.labels import LABEL_CLASSES
@@ -404,7 +405,7 @@ def _evaluations(
 ) -> Iterator[tuple[str, JsonObject]]:
     """Yields the folders of the evaluations of a step and the content of metrics.json."""
     for path in sorted(workdir.glob("evaluation*/metrics.json")):
-        found = files.read_object(path)
+        found = read_checked(path)
         if found.get("step") == step:
             yield path.parent.name, found
 

@@ -10,6 +10,7 @@ import numpy as np
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.core.files import JsonObject, PathLike
+from radejax.core.manifest import read_checked
 from radejax.evaluation.report import Table, number
 from radejax.visualize.curves import read_metrics
 
@@ -108,7 +109,7 @@ def _score(run: pathlib.Path, config: JsonObject) -> JsonObject:
     """Returns the AP of the report of a run, with its metric and split."""
     path = run / "evaluation" / "metrics.json"
     if path.is_file():
-        metrics = files.read_object(path, "ap", "options", "split")
+        metrics = read_checked(path, "ap", "options", "split")
         protocol = metrics["options"]["protocols"][0]
         start = f"{config['train.best_metric']}/{protocol}/"
         for row in metrics["ap"]:

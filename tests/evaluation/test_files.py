@@ -304,6 +304,25 @@ def test_a_part_of_a_report_has_no_score(two_runs, tmp_path, name):
     assert reason in done.stderr
 
 
+@pytest.mark.parametrize("name", ["metrics.json", "predictions.npz"])
+def test_reports_mixed_by_a_partial_copy_are_rejected(two_runs, tmp_path, name):
+    one, other = (two_runs / "a" / x / "evaluation" for x in ("seed0", "seed1"))
+    report = shutil.copytree(one, tmp_path / "report")
+    words = ["score", str(report), "--out", str(tmp_path / "out"), "--bootstrap", "0"]
+    assert CliRunner().invoke(main, words).exit_code == 0  # a whole copy
+    shutil.copy(other / name, report)
+    compared = ["compare", str(other), str(report)]
+    for command in (words, compared, [*words, "--ground-truth", str(report)]):
+        done = CliRunner().invoke(main, command)
+        assert done.exit_code == 1
+        assert "is mixed of several results, or corrupted: the sha" in done.stderr
+        assert "of predictions.npz differs from the one in metrics.json" in done.stderr
+    shutil.copytree(one, report, dirs_exist_ok=True)
+    shutil.copy(other / "predictions.npz", report / "ground_truth.npz")
+    done = CliRunner().invoke(main, words)
+    assert (done.exit_code, "sha256 of ground_truth.npz" in done.stderr) == (1, True)
+
+
 def test_a_report_replaces_all_of_an_earlier_one(stored):
     folder, source = stored
     out = folder / "out"
