@@ -292,7 +292,7 @@ MIN_LIMIT = 20
 
 
 def sanity_checks(data: EvaluationSet) -> list[str]:
-    """Returns warnings if predicted boxes seem to use another unit, frame or height.
+    """Returns warnings if boxes are missing or copied, or use another unit or frame.
 
     Examples:
         >>> car = {"frame": [0], "box": [[20.0, 0, 0, 4, 2, 1.5, 0]], "cls": ["Sedan"]}
@@ -301,6 +301,15 @@ def sanity_checks(data: EvaluationSet) -> list[str]:
         []
     """
     lines: list[str] = []
+    for name, table in (("objects", data.gt), ("predictions", data.pred)):
+        if not len(table):
+            lines.append(f"there are no {name} of the evaluated classes in the region")
+        rows = np.column_stack([table.frame, table.cls, table.box])
+        if copies := len(rows) - len(np.unique(rows, axis=0)):
+            lines.append(
+                f"{copies} of {len(rows)} {name} are copies of others in their frame, such "
+                "as of a frame that was written twice, and count as mistakes: remove them"
+            )
     box = data.predictions.box
     is_large = np.abs(box[:, 6]) > 2 * np.pi
     if is_large.any():

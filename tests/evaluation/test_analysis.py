@@ -209,10 +209,28 @@ def test_a_correction_removes_the_warning(tmp_path):
     assert made.metrics["warnings"] == []
 
 
+def test_missing_and_copied_boxes_are_reported():
+    truth, found = _scene()
+    twice = {name: np.concatenate([x, x[:3]]) for name, x in found.items()}
+    (line,) = _warnings(twice, truth)
+    assert line.startswith("3 of 63 predictions are copies of others in their frame")
+    of_truth = {name: x for name, x in twice.items() if name != "score"}
+    (line,) = _warnings(found, of_truth)
+    assert line.startswith("3 of 63 objects are copies of others in their frame")
+    # The same box of another class is no copy.
+    assert _warnings(twice | {"cls": ["Sedan"] * 60 + ["Bicycle"] * 3}, truth) == []
+    none = {name: x[:0] for name, x in truth.items()}
+    expected = "there are no objects of the evaluated classes in the region"
+    assert _warnings(found, none)[0] == expected
+    (line,) = _warnings({name: x[:0] for name, x in found.items()}, truth)
+    assert line == expected.replace("objects", "predictions")
+
+
 def test_a_limit_of_predictions_per_frame_is_reported():
     truth, found = _scene()
     rows = np.repeat(np.arange(60), np.linspace(20, 40, 60).astype(int))
     many = {name: column[rows] for name, column in found.items()}
+    many = _moved(many, 0, lambda x: x + np.linspace(0, 1e-3, x.size))  # no copies
     assert _warnings(many, truth) == []
     position = np.concatenate([np.arange(n) for n in np.bincount(rows)])
     cut = {name: column[position < 30] for name, column in many.items()}
