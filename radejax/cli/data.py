@@ -126,7 +126,9 @@ def data() -> None:
 @entry.roots
 @entry.labelled_frames
 @entry.camera_calibration
-@click.option("--deep", is_flag=True, help="Read every radar tensor completely.")
+@click.option(
+    "--deep", is_flag=True, help="Read every radar tensor and image completely."
+)
 @entry.json_option
 def check(
     roots: tuple[str, ...],

@@ -15,6 +15,7 @@ from tqdm import tqdm
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import JsonObject, PathLike
 from radejax.core.structures import CLASSES
+from radejax.data.cameras import front_view
 from radejax.data.check import HealthReport, Rows, count_objects, find_splits
 from radejax.data.dataset import Summary
 from radejax.data.kradar.conditions import KRADAR_CONDITIONS, UNKNOWN_CONDITIONS
@@ -45,8 +46,8 @@ def check_dataset(
 
     Args:
         roots: Folder or folders that contain the sequences.
-        deep: Whether to read and project every radar tensor, which finds all corruption
-            and takes hours.
+        deep: Whether to read every image, and to read and project every radar tensor, which
+            finds all corruption and takes hours.
         progress: Whether to show a progress bar.
         **options: Options of `KRadar`: `labels`, `version`, `camera_calibration`, and the
             `sequence_numbers` and `weather` of the sequences to check.
@@ -82,6 +83,11 @@ def check_dataset(
             corrupted[number] += 1
         except OSError as error:
             summary.problems.append(("tesseract not readable", str(error)))
+    for frame in tqdm(data if deep else (), "check images", disable=not progress):
+        try:
+            front_view(frame)
+        except (DataError, OSError) as error:
+            summary.report("image or calibration", f"{frame.key}: {error}")
     is_kradar = data.grid.shape_drea == RadarGrid.kradar().shape_drea
     rows = []
     for number, folder in folders.items():

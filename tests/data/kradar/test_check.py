@@ -5,6 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
@@ -176,6 +177,20 @@ def test_values_are_read_only_if_asked(root):
     assert check_dataset(root).num_problems == 0
     found = check_dataset(root, deep=True).summary.problem_counts()
     assert found == {"projection corrupted": 1, "tesseract corrupted": 1}
+
+
+def test_an_image_that_is_not_complete_is_found_if_asked(root):
+    number = KRadar(root)[0].header.camera_front
+    path = root / f"1/cam-front/cam-front_{number:05d}.png"
+    path.parent.mkdir(exist_ok=True)
+    Image.new("RGB", (256, 72), "red").save(path)
+    usual = check_dataset(root, deep=True).summary.problems
+    path.write_bytes(path.read_bytes()[:90])
+    assert check_dataset(root).summary.problems == usual
+    found = check_dataset(root, deep=True).summary.problems
+    ((kind, text),) = set(found) - set(usual)
+    assert kind == "image or calibration"
+    assert f"{path}: corrupted, not a readable image" in text
 
 
 def test_a_file_that_cannot_be_read_is_not_corrupted(root, monkeypatch):
