@@ -28,6 +28,7 @@ import uuid
 from collections.abc import Iterable, Mapping, Sequence
 
 from radejax.core import files
+from radejax.core.archives import wrap_read_errors
 from radejax.core.errors import DataError, UserError
 from radejax.core.files import JsonObject, PathLike
 from radejax.core.version import __version__
@@ -89,13 +90,14 @@ def read_checked(path: pathlib.Path, *keys: str) -> JsonObject:
             of the folder is not the one that was written with it.
     """
     content = files.read_object(path, *keys)
-    stored = content.get("sha256", {})
+    with wrap_read_errors(path, "a description with checksums of files"):
+        stored = dict(content.get("sha256", {}))
     for name, sha256 in checksums(path.parent, *stored).items():
         if sha256 != stored[name]:
             raise DataError(
-                f"{files.relative(path.parent)} is mixed of several results, or corrupted: "
-                f"the sha256 of {name} differs from the one in {path.name}; copy the whole "
-                "folder, or make the results again"
+                f"{files.relative(path.with_name(name))} is corrupted or of another folder: its "
+                f"sha256 differs from the one in {path.name}; copy the whole folder, or write "
+                "it again"
             )
     return content
 
@@ -191,21 +193,17 @@ class Manifest:
             "names": list(names),
         }
         fix = f"choose another folder{option}, or delete that one"
+        path = folder / FILE
+        there = files.read_object(path) if path.exists() else None
         written = files.find_files(folder, *patterns) if folder.is_dir() else []
-        if written and not (folder / FILE).exists():
+        if written and there is None:
             raise UserError(
                 f"{files.relative(written[0])} is there, but no {FILE} that describes how "
                 f"it was made: {fix}"
             )
-        try:
-            ignore = ("radejax",)
-            other = f"other {what}"
-            files.claim(folder / FILE, wanted, other, fix=fix, ignore=ignore)
-        except UserError:
-            same = files.read_object(folder / FILE).get("what") == what
-            if written or not patterns or not same:
-                raise
-            files.write_json(folder / FILE, wanted)
+        if there and not written and there.get("what") == what and patterns:
+            files.write_json(path, wanted)
+        files.claim(path, wanted, f"other {what}", fix=fix, ignore=["radejax"])
         return cls(folder, options, tuple(names))
 
     def is_done(self, name: str, sources: State) -> bool:

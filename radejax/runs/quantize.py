@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 import json
 import logging
 import pathlib
@@ -16,6 +15,7 @@ import numpy as np
 from radejax.config import Config
 from radejax.core import files
 from radejax.core.errors import UserError
+from radejax.core.manifest import checksums
 from radejax.core.structures import Boxes, Detections
 from radejax.data.dataset import LabelledFrame
 from radejax.data.projection import decode
@@ -114,7 +114,7 @@ def _quantize(folder: pathlib.Path, data: Data, frames: Sequence[LabelledFrame])
             weight_type=quantization.QuantType.QInt8,
         )
         num_saved -= path.stat().st_size
-        content["sha256"][name] = hashlib.sha256(path.read_bytes()).hexdigest()
+        content["sha256"] |= checksums(folder, name)
     files.write_json(folder / CONFIG_FILE, content)
     return num_saved
 

@@ -5,10 +5,13 @@ import os
 
 import pytest
 
+from radejax.core import files
 from radejax.core.errors import DataError, UserError
 from radejax.core.manifest import (
     Manifest,
     add,
+    checksums,
+    read_checked,
     read_sources,
     state_of,
     warn_of_changes,
@@ -112,3 +115,27 @@ def test_missing_and_foreign_files_are_distinguished(tmp_path, logged, there, me
         (tmp_path / f"{name}.json").write_text("[]")
     with pytest.raises(DataError, match=f"{message}.*; fix it"):
         Manifest.open(tmp_path).check_whole("*.json", "fix it")
+
+
+def test_files_that_are_not_those_of_a_description_are_rejected(tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).write_text(name)
+    path = tmp_path / "report.json"
+    sums = checksums(tmp_path, "a", "b", "missing")
+    # $ printf a | sha256sum
+    assert sums["a"].startswith("ca978112ca1bbdcafac231b39a23dc4d")
+    assert list(sums) == ["a", "b"]
+    for content in ({}, {"sha256": sums}, {"sha256": {**sums, "missing": ""}}):
+        files.write_json(path, content)
+        assert read_checked(path) == content
+    (tmp_path / "b").write_text("a")
+    with pytest.raises(
+        DataError, match="/b is corrupted or of another folder: its sha"
+    ):
+        read_checked(path)
+    for wrong in (5, [1], None, "text"):
+        files.write_json(path, {"sha256": wrong})
+        with pytest.raises(
+            DataError, match=r"report\.json: corrupted, not a description"
+        ):
+            read_checked(path)
