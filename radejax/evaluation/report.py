@@ -56,9 +56,6 @@ if TYPE_CHECKING:
 STALE = ("kitti", "precision_recall_*", "reliability.*", "thresholds.*")
 """Patterns of the names of what only some reports contain."""
 
-INPUTS = ("frames.json", "ground_truth.npz", "predictions.npz")
-"""Names of the files from which a report can be made again."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Report:
@@ -178,7 +175,8 @@ def write_report(
         # The stored predictions have repaired sizes, so that they can be evaluated again.
         write_boxes(folder / "predictions.npz", data.predictions, frames)
         write_boxes(folder / "ground_truth.npz", data.ground_truth, frames)
-        metrics["sha256"] = manifest.checksums(folder, *INPUTS)
+        inputs = ("frames.json", "ground_truth.npz", "predictions.npz")
+        metrics["sha256"] = manifest.checksums(folder, *inputs)
         files.write_json(folder / "metrics.json", metrics)
         if options.kitti:
             least = options.settings_of("kradar_r40")["score_threshold"]

@@ -403,10 +403,18 @@ def _identity(workdir: pathlib.Path, step: int, run: JsonObject) -> JsonObject:
 def _evaluations(
     workdir: pathlib.Path, step: int | None
 ) -> Iterator[tuple[str, JsonObject]]:
-    """Yields the folders of the evaluations of a step and the content of metrics.json."""
+    """Yields the folders of the evaluations of a step and the content of metrics.json.
+
+    Those with files of another evaluation are left out with a warning.
+    """
     for path in sorted(workdir.glob("evaluation*/metrics.json")):
-        found = read_checked(path)
-        if found.get("step") == step:
+        if files.read_object(path).get("step") != step:
+            continue
+        try:
+            found = read_checked(path)
+        except DataError as error:
+            _log.warning("an evaluation is left out: %s", error)
+        else:
             yield path.parent.name, found
 
 

@@ -329,6 +329,20 @@ def _evaluation(workdir, name, step, chosen_on, thresholds):
     (workdir / name / "metrics.json").write_text(json.dumps(found))
 
 
+def test_an_evaluation_with_files_of_another_one_is_left_out(tmp_path, caplog):
+    model = dataclasses.replace(small.detector().saved, step=7)
+    _evaluation(tmp_path, "evaluation", 7, "the validation split", {"Sedan": 0.7})
+    path = tmp_path / "evaluation" / "metrics.json"
+    sums = {"sha256": {"predictions.npz": "of another file"}}
+    path.write_text(json.dumps(json.loads(path.read_text()) | sums))
+    saved_models.with_chosen_thresholds(model, tmp_path, "best_f1")
+    path.with_name("predictions.npz").touch()
+    with pytest.raises(UserError, match="no evaluation of step 7 chose"):
+        saved_models.with_chosen_thresholds(model, tmp_path, "best_f1")
+    assert "an evaluation is left out: " in caplog.text
+    assert "predictions.npz is corrupted or of another folder" in caplog.text
+
+
 def test_the_thresholds_of_the_validation_split_are_exported(tmp_path, caplog):
     run = tmp_path / "run"
     run.mkdir()
