@@ -28,7 +28,7 @@ from radejax.data.dataset import LabelledFrame, LabelledFrames
 from radejax.data.projection import linear_power, to_log_scale
 from radejax.geometry.camera import LOOKING_AHEAD, CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.models.options import RadeNetOptions
+from radejax.models.options import RadeNetOptions, azimuth_axis_deg
 from radejax.visualize.style import save_figure
 
 # Labels have no height. These are those of the SDK.
@@ -169,6 +169,7 @@ def get_config() -> Config:
         heatmap_prior=0.02,
         input_center=0.11,  # mean of the input, which training prints
         input_scale=20.0,
+        beam_azimuth_deg=azimuth_axis_deg(GRID),
     )
     return Config().replace(
         classes=CLASSES,

@@ -19,6 +19,7 @@ import types
 from collections.abc import Collection, Mapping
 from typing import Annotated, Any
 
+import numpy as np
 import pydantic
 from annotated_types import MinLen
 
@@ -40,7 +41,11 @@ from radejax.evaluation.evaluation_set import SPACES
 from radejax.evaluation.results import EvaluationOptions
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.detection import LossOptions
-from radejax.models.options import RadeNetOptions
+from radejax.models.options import (
+    RadeNetOptions,
+    axis_centers,
+    azimuth_axis_deg,
+)
 from radejax.simulation.config import SimulationOptions
 from radejax.training.options import LoggingOptions, TrainOptions
 
@@ -175,7 +180,7 @@ class Config(Options):
 
 
 def check_bins(model: RadeNetOptions, grid: RadarGrid, source: str) -> None:
-    """Raises `UserError` if the Doppler or elevation bins of a model and a grid differ.
+    """Raises `UserError` if Doppler bins, elevation bins or beams of a model and a grid differ.
 
     Args:
         model: Options of the model.
@@ -187,6 +192,12 @@ def check_bins(model: RadeNetOptions, grid: RadarGrid, source: str) -> None:
         expected = getattr(grid, f"num_{name}")
         text = f"{expected}, as {source} has"
         require(bins == expected, f"config.model.{name}_bins", bins, text)
+    if (axis := model.beam_azimuth_deg) is not None:
+        azimuth_deg = np.rad2deg(grid.azimuth_rad)
+        found = axis_centers(axis, grid.num_azimuth)
+        expected = f"{azimuth_axis_deg(grid)}, as {source} has"
+        is_equal = np.allclose(found, azimuth_deg, atol=0.01)
+        require(is_equal, "config.model.beam_azimuth_deg", axis, expected)
 
 
 # Config files ------------------------------------------------------------------------

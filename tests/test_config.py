@@ -126,6 +126,10 @@ def test_a_value_that_its_type_allows_is_named(field: str, value: Any) -> None:
             "model.elevation_bins is 0, expected above 0 if config.model.doppler_bins",
         ),
         ({"model.elevation_bins": 0}, "model.fusion.weighting is 'mlp', expected"),
+        (
+            {"model.beam_azimuth_deg": (-180.0, 0.9)},
+            r"model.beam_azimuth_deg is \(-180.0, 0.9\), expected \(-50.0, 1.8.*\), as conf",
+        ),
         ({"model.num_groups": 64}, r"model.widths\[0\] is 32, expected a multiple of"),
         (
             {"model.num_groups": 32, "model.heads": "default"},

@@ -83,6 +83,11 @@ class RadeNetOptions(Options, section="config.model"):
     """Multiplied with the projection after the subtraction, above 0; 1 in the paper. An echo
     10 dB above the noise differs from it by 0.054, and with a factor of 20 by 1.1, which is a
     usual magnitude of a network's input."""
+    beam_azimuth_deg: Axis | None = None
+    """Azimuth of the first bin and the step, or of all bins, in degrees, positive to the right (see
+    `azimuth_axis_deg`). The heads then predict offsets and yaws relative to the direction of the
+    beam, for radars that scan 360 degrees: convolutions do not know the azimuth that they would
+    need for the usual yaws. None: relative to the vehicle, as in the paper."""
     outputs: Annotated[
         Mapping[str, Size],
         pydantic.AfterValidator(freeze),
@@ -254,15 +259,12 @@ class QueryGridOptions(Options, section="config.model.query_grid"):
         range_m = grid.range_m
         if is_uniform(range_m):
             range_m = np.array([range_m[0], grid.range_step_m])
-        azimuth = grid.azimuth_rad
-        if is_uniform(azimuth):
-            azimuth = np.array([azimuth[0], grid.azimuth_step_rad])
         elevation = grid.elevation_rad
         if elevation.size < 2:
             elevation = RadarGrid.kradar().elevation_rad
         return cls(
             range_m=range_m.tolist(),
-            azimuth_deg=np.rad2deg(azimuth).tolist(),
+            azimuth_deg=azimuth_axis_deg(grid),
             elevation_deg=np.rad2deg(elevation[[0, -1]]).tolist(),
         )
 
@@ -288,8 +290,8 @@ class QueryGridOptions(Options, section="config.model.query_grid"):
         `xp` a compiled program does not contain all centers as a constant. The result is
         float64 for NumPy and float32 for JAX.
         """
-        range_m = _centers(self.range_m, num_range)
-        azimuth = np.deg2rad(_centers(self.azimuth_deg, num_azimuth))
+        range_m = axis_centers(self.range_m, num_range)
+        azimuth = np.deg2rad(axis_centers(self.azimuth_deg, num_azimuth))
         low, high = self.elevation_deg
         part = (np.arange(num_elevation) + 0.5) / num_elevation
         elevation = np.deg2rad(low + (high - low) * part)
@@ -302,7 +304,31 @@ class QueryGridOptions(Options, section="config.model.query_grid"):
         return centers
 
 
-def _centers(axis: tuple[float, ...], count: int) -> Float[np.ndarray, " {count}"]:
+def azimuth_axis_deg(grid: RadarGrid) -> tuple[float, ...]:
+    """Returns the first azimuth and the step of a grid in degrees, or all azimuths if they are not
+    uniform.
+
+    Examples:
+        >>> [round(value, 6) for value in azimuth_axis_deg(RadarGrid.kradar())]
+        [-53.0, 1.0]
+    """
+    azimuth = grid.azimuth_rad
+    if is_uniform(azimuth):
+        azimuth = np.array([azimuth[0], grid.azimuth_step_rad])
+    return tuple(np.rad2deg(azimuth).tolist())
+
+
+def axis_centers(axis: tuple[float, ...], count: int) -> Float[np.ndarray, " {count}"]:
+    """Returns the centers of an axis, which continues into padding.
+
+    Args:
+        axis: First center and step, or all centers.
+        count: Number of centers.
+
+    Examples:
+        >>> axis_centers((-2.0, 1.5), 3).tolist(), axis_centers((0.0, 1.0, 4.0), 4).tolist()
+        ([-2.0, -0.5, 1.0], [0.0, 1.0, 4.0, 7.0])
+    """
     if len(axis) == 2:
         return axis[0] + axis[1] * np.arange(count)
     return values_at(np.array(axis), np.arange(count))

@@ -11,6 +11,7 @@ from typing import TypeVar
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
 from radejax.core.errors import UserError
@@ -19,7 +20,7 @@ from radejax.core.structures import DetectionMaps
 from radejax.models.backbone import BACKBONES
 from radejax.models.heads import NECKS, Heads
 from radejax.models.layers import Map, Part, PartFields
-from radejax.models.options import RadeNetOptions
+from radejax.models.options import RadeNetOptions, axis_centers
 
 Projection = Float[jax.Array, "B R A DE"]
 PartT = TypeVar("PartT", bound=Part)
@@ -107,7 +108,11 @@ class RadeNet(nn.Module):
             **self._shared(),
             name="heads",
         )
-        maps = heads(neck(**self._shared(), name="neck")(features))
+        maps: DetectionMaps = heads(neck(**self._shared(), name="neck")(features))
+        if options.beam_azimuth_deg is not None:
+            azimuth_deg = axis_centers(options.beam_azimuth_deg, features.shape[2])
+            params = vehicle_from_beam(maps.box_params, np.deg2rad(azimuth_deg))
+            maps = maps.replace(box_params=params)
         if options.crop_output:
             r, a = projection.shape[1:3]
             maps = jax.tree.map(lambda m: m[:, :r, :a], maps)
@@ -122,3 +127,36 @@ class RadeNet(nn.Module):
             "dtype": jnp.dtype(self.options.dtype),
             "remat": self.options.remat != "none",
         }
+
+
+def vehicle_from_beam(
+    params: Float[jax.Array, "B R A 8"], azimuth_rad: Float[np.ndarray, " A"]
+) -> Float[jax.Array, "B R A 8"]:
+    """Turns box parameters from the direction of each bin's beam to the vehicle's axes.
+
+    Args:
+        params: `[B, R, A, 8]` dx, dy, z, l, w, h, sin yaw, cos yaw, where x is along the beam.
+        azimuth_rad: `[A]` azimuths of the beams, positive to the right.
+
+    Returns:
+        `[B, R, A, 8]` the same with x forward.
+
+    Examples:
+        >>> ahead = jnp.array([1.0, 0, 0, 4, 2, 1, 0, 1]).reshape(1, 1, 1, 8)
+        >>> vehicle_from_beam(ahead, np.array([np.pi / 2]))[0, 0, 0].round(3).tolist()
+        [0.0, -1.0, 0.0, 4.0, 2.0, 1.0, -1.0, 0.0]
+    """
+    cos = jnp.asarray(np.cos(azimuth_rad), params.dtype)[None, None]
+    sin = jnp.asarray(np.sin(azimuth_rad), params.dtype)[None, None]
+    dx, dy, z, length, width, height, sin_yaw, cos_yaw = jnp.moveaxis(params, -1, 0)
+    turned = (
+        cos * dx + sin * dy,
+        cos * dy - sin * dx,
+        z,
+        length,
+        width,
+        height,
+        cos * sin_yaw - sin * cos_yaw,
+        cos * cos_yaw + sin * sin_yaw,
+    )
+    return jnp.stack(turned, -1)

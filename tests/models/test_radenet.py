@@ -9,7 +9,9 @@ from flax import traverse_util
 
 from radejax import models
 from radejax.core.errors import UserError
+from radejax.geometry.boxes import boxes7_from_8
 from radejax.models.options import RadeNetOptions
+from radejax.models.radenet import vehicle_from_beam
 
 from ..small_models import drawn
 
@@ -55,6 +57,30 @@ def test_center_and_scale_are_those_of_the_input(small, variables, apply):
     np.testing.assert_allclose(
         seen[:, :21, :14].astype(np.float32), (x - 0.545) * 25.0, rtol=2**-8
     )
+
+
+def test_a_turned_scene_gives_turned_boxes():
+    params = jax.random.normal(jax.random.key(0), (1, 4, 5, 8))
+    azimuth_rad = np.deg2rad([-120.0, -40.0, 0.0, 90.0, 170.0])
+    found = boxes7_from_8(vehicle_from_beam(params, azimuth_rad))
+    seen = boxes7_from_8(params)
+    turn = np.asarray(found - seen)[..., 6] + azimuth_rad
+    np.testing.assert_allclose(np.cos(turn), 1, atol=1e-5)
+    offset, expected = (np.asarray(x[..., 0] + 1j * x[..., 1]) for x in (found, seen))
+    np.testing.assert_allclose(offset, expected * np.exp(-1j * azimuth_rad), atol=1e-5)
+    chex.assert_trees_all_equal(found[..., 2:6], seen[..., 2:6])
+
+
+def test_yaws_and_offsets_turn_with_the_beam(small, variables, apply):
+    """Also of padded columns, and nothing else does."""
+    x = jax.random.uniform(jax.random.key(0), (1, 21, 14, 13))
+    beams = small.replace(beam_azimuth_deg=(-180.0, 25.0))
+    found = jax.jit(models.build(beams).apply)(variables, x)
+    maps = apply(variables, x)
+    assert found.box_params.shape[2] == 16
+    azimuth_rad = np.deg2rad(-180 + 25.0 * np.arange(16))
+    expected = vehicle_from_beam(maps.box_params, azimuth_rad)
+    chex.assert_trees_all_close(found, maps.replace(box_params=expected), atol=1e-5)
 
 
 @pytest.mark.slow
