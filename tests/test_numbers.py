@@ -30,6 +30,7 @@ OTHERS = {
     "0.75": "heatmap sigma",
     "1.2": "range bin of the quickstart in meters",
     "1,024": "held-out scenes of quickstart_realistic.json",
+    "5,600": "steps of the quickstart",
     "1,440": "docs/protocols.md, APs that were compared",
     "2.0": "license",
     "2.1": "label version",
