@@ -264,11 +264,16 @@ def config_name(filename: str) -> str:
 
 
 def load_module(path: str | os.PathLike[str]) -> types.ModuleType:
-    """Loads a Python file that is not in a package, such as a config file, as a module."""
-    spec = importlib.util.spec_from_file_location(pathlib.Path(path).stem, path)
+    """Loads a Python file that is not in a package, such as a config file, as a module.
+
+    In `sys.modules`, its name is its path, which no import statement finds.
+    """
+    name = os.path.abspath(path).replace(".", "_")  # a dot would separate packages
+    spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None  # for Python files, both are set
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses find the module of their annotations there
     spec.loader.exec_module(module)
     return module
 

@@ -4,7 +4,9 @@ import itertools
 import json
 import math
 import pathlib
+import pickle
 import re
+import sys
 from typing import Any
 
 import pytest
@@ -304,6 +306,23 @@ def test_texts_are_set_together_and_models_have_the_options_of_their_class() -> 
 def test_names_of_runs() -> None:
     assert config_name("configs/quickstart.py") == "quickstart"
     assert config_name("a/b/radenet.py:stem,sedan") == "radenet-stem-sedan"
+
+
+def test_config_files_of_a_name_may_have_dataclasses(tmp_path: pathlib.Path) -> None:
+    """Also with annotations as texts, which dataclasses look up by the module's name."""
+    lines = "from __future__ import annotations", "import dataclasses", "import radejax"
+    cls = "@dataclasses.dataclass(slots=True)\nclass Part:\n    number: int = {}"
+    function = "def get_config():\n    return radejax.Config(seed=Part().number)"
+    for number in (1, 2):
+        path = tmp_path / str(number) / "jax.py"
+        path.parent.mkdir()
+        path.write_text("\n".join([*lines, cls.format(number), function]))
+        config = load_config(str(path))
+        assert pickle.loads(pickle.dumps(config)).seed == number
+    first, second = (load_module(tmp_path / n / "jax.py").Part for n in "12")
+    assert pickle.loads(pickle.dumps(first())).number == 1
+    assert pickle.loads(pickle.dumps(second())).number == 2
+    assert sys.modules["jax"].__spec__.name == "jax"
 
 
 def test_data_paths_differ_from_machine_to_machine() -> None:
