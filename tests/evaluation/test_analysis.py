@@ -197,6 +197,13 @@ def test_another_unit_or_frame_is_reported(column, change, expected):
     assert re.search(expected, lines[0]), lines
 
 
+def test_a_radar_may_see_behind():
+    truth, found = _scene()
+    around = np.where(np.arange(60) % 2, 1, -1)
+    truth, found = (_moved(x, 0, lambda x_m: x_m * around) for x in (truth, found))
+    assert _warnings(found, truth) == []
+
+
 def test_a_correction_removes_the_warning(tmp_path):
     truth, found = _scene()
     wrong = _moved(_moved(found, 6, np.rad2deg), 2, lambda z: z + 0.7)
