@@ -29,7 +29,7 @@ from annotated_types import Ge, Gt, Le
 from jax import lax
 from jaxtyping import Complex, Float, Inexact, Num
 
-from radejax.core.errors import DataError, require
+from radejax.core.errors import DataError, UserError, require
 from radejax.core.options import Fraction, Options, Positive
 from radejax.core.structures import Array
 from radejax.geometry.radar_grid import RadarGrid
@@ -185,7 +185,6 @@ def _window(place: Float[np.ndarray, "n axes"], pedestal: float) -> Window:
     return normalized
 
 
-@functools.partial(jax.jit, static_argnames="radar")
 def adc_to_power(
     samples: Num[Array, "D T Q N"],
     radar: FmcwRadar,
@@ -198,8 +197,8 @@ def adc_to_power(
     all virtual antennas for every direction. The compensation uses the velocity of the Doppler
     bin, so targets faster than the Doppler axis appear at wrong angles as well.
 
-    White noise has the same mean power in the tensor as in the samples. The function is
-    jitted and supports `jax.vmap`.
+    White noise has the same mean power in the tensor as in the samples. The computation is
+    jitted. Inside of `jax.jit` and `jax.vmap`, the values of samples are not checked.
 
     Args:
         samples: Samples by chirp, transmitter, receiver and time, complex or real.
@@ -210,18 +209,55 @@ def adc_to_power(
         float32 linear power on the axes of `radar.make_grid()`.
 
     Raises:
-        UserError: The samples do not have the radar's shape, or are complex for a real one.
+        UserError: The samples do not have the radar's shape, are complex for a real one,
+            unsigned, not finite or all 0, or the calibration does not have a factor per channel.
     """
-    is_complex = jnp.issubdtype(samples.dtype, jnp.complexfloating)
+    # Outside of jit, whose errors end with remarks of JAX.
     expected = f"{radar.shape}: num_chirps, tx_m, rx_m, num_samples of the radar"
     require(samples.shape == radar.shape, "shape of samples", samples.shape, expected)
     expected = f"{'complex' if radar.is_complex else 'real'}, as radar.is_complex"
-    is_same = is_complex == radar.is_complex
+    is_same = jnp.iscomplexobj(samples) == radar.is_complex
     require(is_same, "type of samples", samples.dtype.name, expected)
+    if calibration is not None:
+        found, channels = np.shape(calibration), radar.shape[1:3]
+        expected = f"{channels}: tx_m, rx_m of the radar"
+        require(found == channels, "shape of calibration", found, expected)
+    if not isinstance(samples, jax.core.Tracer):
+        _check_values(np.asarray(samples))
+    power: Float[jax.Array, "D R E A"] = _to_power(samples, radar, calibration)
+    return power
+
+
+def _check_values(samples: Num[np.ndarray, "D T Q N"]) -> None:
+    """Raises `UserError` for samples that no ADC records, or that were read as unsigned."""
+    num_wrong = int((~np.isfinite(samples)).sum())
+    require(num_wrong == 0, "number of samples that are not finite", num_wrong, "0")
+    if not samples.any():
+        raise UserError("all samples are 0: check the recording and the frame's number")
+    parts = np.stack([samples.real, samples.imag])
+    is_whole = bool((parts == np.rint(parts)).all())
+    if samples.dtype.kind == "u" or (
+        is_whole and parts.min() >= 0 and parts.max() >= 1 << 15
+    ):
+        raise UserError(
+            f"samples are unsigned, from {parts.min():g} to {parts.max():g}, expected signed "
+            "ones: x.astype(np.uint16).view(np.int16) converts two's complement of 16 bits "
+            "(of complex samples, real and imaginary parts); subtract the middle, such as "
+            "32768, from offset binary"
+        )
+
+
+@functools.partial(jax.jit, static_argnames="radar")
+def _to_power(
+    samples: Num[Array, "D T Q N"],
+    radar: FmcwRadar,
+    calibration: Num[Array, "T Q"] | None,
+) -> Float[jax.Array, "D R E A"]:
+    """Computes the tensor of `adc_to_power`."""
     grid = radar.make_grid()
     of_range, of_doppler, weights = radar.windows()
     num_doppler, num_tx, num_rx, _ = radar.shape
-    transform = jnp.fft.fft if is_complex else jnp.fft.rfft
+    transform = jnp.fft.fft if radar.is_complex else jnp.fft.rfft
     spectrum = transform(samples * of_range[None, None, None])[..., : grid.num_range]
     signals = jnp.fft.fft(spectrum * of_doppler[:, None, None, None], axis=0)
     signals = jnp.fft.fftshift(signals, axes=0)  # [D, T, Q, R]

@@ -272,5 +272,52 @@ def test_wrong_radars_are_named(change, message):
     ],
 )
 def test_samples_of_other_radars_are_named(samples, message):
-    with pytest.raises(UserError, match=re.escape(message)):
+    with pytest.raises(UserError, match=re.escape(message)) as error:
         adc_to_power(samples, RADAR)
+    assert not getattr(error.value, "__notes__", None)  # as JAX adds them inside of jit
+    assert error.value.__cause__ is None
+
+
+COUNTS = (
+    np.random.default_rng(0).integers(-300, 300, (2, *RADAR.shape)).astype(np.int16)
+)
+SAMPLES = COUNTS[0] + 1j * COUNTS[1]
+WRAPPED = COUNTS.view(np.uint16)  # two's complement
+REAL = RADAR.replace(is_complex=False)
+
+
+@pytest.mark.parametrize(
+    ("radar", "samples", "message"),
+    [
+        (
+            RADAR,
+            np.where(np.arange(16)[:, None, None, None] == 3, np.nan, SAMPLES),
+            "number of samples that are not finite is 768, expected 0",
+        ),
+        (REAL, np.where(COUNTS[0] > 298, np.inf, 1.0), "that are not finite is"),
+        (RADAR, 0 * SAMPLES, "all samples are 0: check"),
+        (REAL, 0 * COUNTS[0], "all samples are 0: check"),
+        (REAL, WRAPPED[0], "samples are unsigned, from 0 to 65535, exp"),
+        (REAL, WRAPPED[0].astype(float), "unsigned, from 0 to 65535, "),
+        (RADAR, WRAPPED[0] + 1j * WRAPPED[1], "unsigned, from 0 to 65535, "),
+        (REAL, (COUNTS[0] + 2048).astype(np.uint16), "subtract the middle, such as"),
+    ],
+)
+def test_samples_that_no_adc_records_are_named(radar, samples, message):
+    with pytest.raises(UserError, match=message):
+        adc_to_power(samples, radar)
+
+
+def test_the_advice_on_unsigned_samples_restores_them():
+    floats = WRAPPED.astype(float)
+    real, imag = (x.astype(np.uint16).view(np.int16) for x in floats)
+    np.testing.assert_array_equal(real + 1j * imag, SAMPLES)
+    large = 40000.0 + COUNTS[0] + 0.5  # not counts
+    assert np.isfinite(power_of(REAL, large)).all()
+
+
+@pytest.mark.parametrize("shape", [(2, 3), (12,), (3, 1)])
+def test_calibrations_of_other_channels_are_named(shape):
+    message = f"shape of calibration is {shape}, expected (3, 4): tx_m, rx_m"
+    with pytest.raises(UserError, match=re.escape(message)):
+        adc_to_power(SAMPLES, RADAR, np.ones(shape))
