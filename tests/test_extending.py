@@ -322,6 +322,17 @@ def test_what_a_reader_forgets_is_named(
     flat = replace(frames[0], boxes=np.array([[12.0, 1.0, 4.2, 1.8, 0.1]]))
     assert flat.boxes.tolist() == [[12.0, 1.0, 0.0, 4.2, 1.8, 1.5, 0.1]]
 
+    # The frame that is read is one with a camera, whose calibration is of twice its size.
+    data = toy.Toy([replace(frames[0], name="0000", camera_path=None), *frames], grid)
+    assert check_frames(data, classes, [str(root)]).num_problems == 0
+    camera = json.loads((root / "camera.json").read_text())
+    camera |= {"width": 2 * camera["width"], "height": 2 * camera["height"]}
+    (root / "camera.json").write_text(json.dumps(camera))
+    (_, problem), *others = check_frames(data, classes, [str(root)]).summary.problems
+    assert problem.startswith("1/0001: ")
+    assert "camera.json: principal point 24, 16 in" in problem
+    assert not others
+
     # Problems of files that only `data check` and `preprocess` find.
     decibels = lambda *_: np.full(grid.projection_shape, 0.5, np.float32)  # noqa: E731
     monkeypatch.setattr(toy.ToyFrame, "read_projection", decibels)

@@ -130,13 +130,14 @@ def front_view(
         one; and the calibration. Missing items are None, and both are None without an image.
 
     Raises:
-        DataError: A file is corrupted.
+        DataError: A file is corrupted, or the principal point is far from the middle.
     """
     if frame.camera_path is None:
         return None, None
     camera = None
     if frame.camera_calibration_path is not None:
         camera = frame.read_calibration()
+        camera.require_centered(frame.camera_calibration_path)
     size = None if camera is None else (camera.height, camera.width)
     return read_left_image(
         frame.camera_path, size or IMAGE_SIZE, resize=True, calibrated_size=size
@@ -213,7 +214,8 @@ def camera_inputs(
         UserError: A frame has no image or calibration and `allow_missing` is False; a
             calibration is for another image size and `resize` is False; or an image is
             not among the features.
-        DataError: A calibration file is corrupted.
+        DataError: A calibration file is corrupted, or its principal point is far from the
+            middle of the image.
     """
     sources: list[pathlib.Path | str | None] = [frame.camera_path for frame in frames]
     if features is not None:
@@ -270,6 +272,7 @@ def _camera(
         The camera, and the height and width of the images of the calibration file.
     """
     calibration = frame.read_calibration(radar_from_lidar_m)
+    calibration.require_centered(frame.camera_calibration_path)
     height, width = image_size
     size = calibration.height, calibration.width
     if size != image_size:

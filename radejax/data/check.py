@@ -94,7 +94,7 @@ def check_frames(
         classes: Classes of their objects.
         roots: Folders of the dataset, for the report.
         deep: Whether to read radar data, image and calibration of every frame, instead of
-            the first one of each sequence.
+            those of one frame of each sequence, the first with most of these files.
         progress: Whether to show a progress bar.
     """
     summary = frames.summary()
@@ -102,7 +102,8 @@ def check_frames(
     sequences: dict[int, list[LabelledFrame]] = {}
     for frame in frames:
         sequences.setdefault(frame.sequence, []).append(frame)
-    read = [x for own in sequences.values() for x in own[: None if deep else 1]]
+    groups = sequences.values()
+    read = list(frames) if deep else [min(own, key=_num_missing) for own in groups]
     for frame in tqdm(read, "check", unit="frame", disable=not progress):
         try:
             frame.read_checked(frames.grid)
@@ -122,6 +123,12 @@ def check_frames(
     reader = f"read by {type(frames).__module__}:{type(frames).__qualname__}"
     objects = count_objects(frames, splits, classes)
     return HealthReport(list(roots), reader, rows, objects, summary)
+
+
+def _num_missing(frame: LabelledFrame) -> int:
+    """Returns how many of radar data, image and calibration a frame lacks."""
+    files = frame.radar_path, frame.camera_path, frame.camera_calibration_path
+    return files.count(None)
 
 
 def find_splits(data: LabelledFrames[LabelledFrame]) -> dict[str, str]:

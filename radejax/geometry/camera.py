@@ -355,12 +355,32 @@ class CameraCalibration(ArrayValues):
 
     # Use -----------------------------------------------------------------------------
 
-    def require_view_ahead(self, source: object) -> None:
-        """Raises a `DataError` unless a front camera can see objects ahead of the radar.
+    def require_centered(self, source: object) -> None:
+        """Raises a `DataError` if intrinsics and size seem to be of different images.
+
+        The principal point must be in the middle third of the width and within the height,
+        of which a part above or below may have been cut off.
 
         Args:
             source: Name of the calibration for the error message.
         """
+        cx, cy = self.intrinsics[2:].tolist()
+        if not (abs(cx / self.width - 0.5) <= 1 / 6 and 0 <= cy <= self.height):
+            raise DataError(
+                f"{source}: principal point {cx:.5g}, {cy:.5g} in an image of {self.width} x "
+                f"{self.height} pixels, expected one in the middle third of the width and "
+                "within the height: give intrinsics and size of the same image"
+            )
+
+    def require_view_ahead(self, source: object) -> None:
+        """Raises a `DataError` unless a front camera can see objects ahead of the radar.
+
+        Intrinsics and size must also fit together, see `require_centered`.
+
+        Args:
+            source: Name of the calibration for the error message.
+        """
+        self.require_centered(source)
         range_m, azimuth_rad = np.meshgrid(
             np.arange(5.0, 61), np.deg2rad(_AZIMUTHS_DEG)
         )

@@ -11,6 +11,7 @@ from radejax.data.cameras import (
     IMAGE_SIZE,
     CameraOptions,
     camera_inputs,
+    front_view,
     read_left_image,
 )
 from radejax.data.kradar import Frame
@@ -70,6 +71,19 @@ def test_cameras_project_as_their_calibration(frames):
         assert camera.is_valid
     fixed = frame_cameras(frames, (32, 64), radar_from_lidar_m=(1.0, 2.0, 3.0))
     np.testing.assert_allclose(fixed[0].cam_from_ego, cameras[1].cam_from_ego)
+
+
+def test_a_calibration_for_images_of_twice_the_size_is_named(frames, monkeypatch):
+    """By any reader, before its image is read."""
+    double = dataclasses.replace(CALIBRATION, width=128, height=64)
+    monkeypatch.setattr(_Frame, "read_calibration", lambda frame, shift=None: double)
+    message = (
+        r"cam_front0\.yml: principal point 32, 16 in an image of 128 x 64 pixels, "
+    )
+    with pytest.raises(DataError, match=message):
+        front_view(frames[0])
+    with pytest.raises(DataError, match=message):
+        frame_cameras(frames, (32, 64))
 
 
 def test_boxes_have_no_say_in_the_height_that_queries_start_at(frames):
@@ -155,7 +169,8 @@ def test_gray_levels_of_16_bits_are_divided_by_256(tmp_path):
 
 @pytest.mark.parametrize("is_pair", [False, True])
 def test_the_size_of_the_calibration_tells_pairs_from_wide_images(tmp_path, is_pair):
-    wide = dataclasses.replace(CALIBRATION, width=1408, height=376)
+    lens = np.array([600.0, 600.0, 704.0, 188.0])
+    wide = dataclasses.replace(CALIBRATION, intrinsics=lens, width=1408, height=376)
     (tmp_path / "cam.yml").write_text(wide.to_kradar_text())
     pixels = np.zeros((376, 1408 * (1 + is_pair), 3), np.uint8)
     pixels[:, :704] = 255  # half of a single image

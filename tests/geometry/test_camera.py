@@ -183,6 +183,36 @@ def test_wrong_arguments_are_named(call, message):
         call()
 
 
+@pytest.mark.parametrize(
+    ("center_px", "size_px", "is_fine"),
+    [
+        ((628.72, 369.31), (1280, 720), True),  # K-Radar
+        ((961.27, 624.9), (1936, 1216), True),  # View-of-Delft
+        ((341.74, 200.74), (672, 376), True),  # RADIATE, and sizes of other images
+        ((341.74, 200.74), (1280, 720), False),  # of nearly the same aspect
+        ((341.74, 200.74), (1344, 376), False),
+        ((341.74, 200.74), (320, 180), False),
+        ((628.72, 30.0), (1280, 380), True),  # without the upper part
+        ((628.72, -30.0), (1280, 320), False),
+    ],
+)
+def test_intrinsics_and_size_are_of_the_same_image(center_px, size_px, is_fine):
+    width, height = size_px
+    camera = forward_camera(
+        intrinsics=(560.0, 560.0, *center_px), width=width, height=height
+    )
+    if is_fine:
+        camera.require_view_ahead("cam.yml")
+        return
+    message = (
+        r"cam\.yml: principal point .*, .* in an image of \d+ x \d+ pixels, expected"
+    )
+    with pytest.raises(DataError, match=message):
+        camera.require_centered("cam.yml")
+    with pytest.raises(DataError, match=message):
+        camera.require_view_ahead("cam.yml")
+
+
 def test_angles_of_the_calibration_tool_are_relative(tmp_path):
     # K-Radar's cam_calib/from_gui_tool/cam_front0.yml; the second pose is the same in the
     # angles of cam_calib/common/cam_front0.yml.

@@ -83,9 +83,11 @@ def check_dataset(
             corrupted[number] += 1
         except OSError as error:
             summary.problems.append(("tesseract not readable", str(error)))
-    for frame in tqdm(data if deep else (), "check images", disable=not progress):
+    seen = data if deep else [own[0] for own in frames.values()]
+    look = front_view if deep else Frame.calibrated_size
+    for frame in tqdm(seen, "check cameras", disable=not progress):
         try:
-            front_view(frame)
+            look(frame)
         except (DataError, OSError) as error:
             summary.report("image or calibration", f"{frame.key}: {error}")
     is_kradar = data.grid.shape_drea == RadarGrid.kradar().shape_drea

@@ -1,3 +1,4 @@
+import dataclasses
 import errno
 import json
 import math
@@ -14,6 +15,8 @@ from radejax.data.dataset import Summary
 from radejax.data.kradar import KRadar, check, write
 from radejax.data.kradar.check import check_dataset
 from radejax.data.kradar.labels import Label
+
+from ... import small_models as small
 
 SEDAN = "expected about 4.61 x 2.18 x 1.91 m"
 
@@ -95,6 +98,20 @@ def test_everything_that_is_wrong_is_named(root, caplog):
     found = {frame.header.radar: frame.tesseract_path for frame in data[:5]}
     assert found[6] is None
     assert found[4] is not None
+
+
+def test_a_camera_calibration_for_other_images_is_reported(root):
+    path = root / "common/cam_front0.yml"
+    path.parent.mkdir()
+    camera = small.calibration(intrinsics=(50.0, 50.0, 32.0, 20.0), width=64, height=40)
+    path.write_text(camera.to_kradar_text())
+    assert check_dataset(root, camera_calibration=root).num_problems == 0
+    wrong = dataclasses.replace(camera, width=128, height=80)
+    path.write_text(wrong.to_kradar_text())
+    problems = check_dataset(root, camera_calibration=root).summary.problems
+    assert [kind for kind, _ in problems] == 2 * ["image or calibration"]  # a sequence
+    text = f"1/00004_00001: {path}: principal point 32, 20 in an image of 128 x 80"
+    assert problems[0][1].startswith(text)
 
 
 @pytest.mark.parametrize(
