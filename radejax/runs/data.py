@@ -45,6 +45,7 @@ _log = logging.getLogger(__name__)
 
 _INPUT_FRAMES = 20
 _KRADAR_INPUT = 0.63  # mean of projections with the noise of K-Radar's public map
+_MAX_INPUT = 3.0  # of the mean that the network sees; usual ones are near 0
 
 
 class Data:
@@ -398,16 +399,23 @@ def open_data(config: Config) -> Data:
 
 
 def _log_input(data: Data, model: RadeNetOptions) -> None:
-    """Logs mean and standard deviation of the input; warns if it is nearly constant."""
+    """Logs mean and standard deviation of the input; warns if they hinder the training."""
     mean, spread = data.usual_input
     _log.info("input: %.3f ± %.3f in the frames to train on", mean, spread)
     seen = model.input_scale * (mean - model.input_center)
-    is_unusual = abs(seen - _KRADAR_INPUT) > 0.1
-    if is_unusual and model.input_scale * spread < 0.05:
+    varied = model.input_scale * spread
+    problem = ""
+    if abs(seen) > _MAX_INPUT:
+        problem = "far from 0"
+    elif varied < 0.05 and abs(seen - _KRADAR_INPUT) > 0.1:
+        problem = f"nearly constant and not that of K-Radar ({_KRADAR_INPUT})"
+    if problem:
         _log.warning(
-            "the network sees a nearly constant input, other than that of K-Radar "
-            "(%.3f): set --config.model.input_center=%.3f --config.model.input_scale=%.3g",
-            _KRADAR_INPUT,
+            "the network sees an input of %.3g ± %.2g, %s: set "
+            "--config.model.input_center=%.3f --config.model.input_scale=%.3g",
+            seen,
+            varied,
+            problem,
             mean,
             0.5 / max(spread, 1e-6),
         )

@@ -105,9 +105,17 @@ def test_frames_are_projected_beside_their_data_once(
         assert re.search(
             r"input: 0\.64\d ± 0\.04\d in the frames to train", caplog.text
         )
-        assert "nearly constant" not in caplog.text
+        assert "the network sees" not in caplog.text
         _open(config.replace(model={"input_center": 0.4}))
-    assert "set --config.model.input_center=0.64" in caplog.text
+        _open(config.replace(model={"input_center": 0.6, "input_scale": 14.0}))
+        _open(config.replace(model={"input_center": 0.1, "input_scale": 20.0}))
+    constant, far = re.findall(r"the network sees .*", caplog.text)
+    advice = "set --config.model.input_center=0.64"
+    assert re.match(r"the network sees an input of 0\.24\d ± 0\.04\d, ", constant)
+    assert f"nearly constant and not that of K-Radar (0.63): {advice}" in constant
+    assert re.match(
+        rf"the network sees an input of 10.\d ± 0.\d+, far from 0: {advice}", far
+    )
     assert data.options.roots == (str(root),)
     assert data.options.records == str(root / "records")
     assert len(data.records.keys()) == 6
