@@ -108,6 +108,7 @@ def process_pool(
     Raises:
         UserError: A process was killed or could not start.
     """
+    end_rerun()
     others = multiprocessing.active_children()
     context = multiprocessing.get_context("spawn")
     begin = functools.partial(_start, start, *arguments)
@@ -129,6 +130,17 @@ def process_pool(
             '`if __name__ == "__main__":`; run the same command again to continue, '
             "with fewer workers"
         ) from None
+
+
+def end_rerun() -> None:
+    """Ends a worker that runs the main script again because it lacks the guard.
+
+    It ends silently, as `process_pool` of the main process raises the error. What has side
+    effects before it starts workers calls this first.
+    """
+    process = multiprocessing.current_process()
+    if getattr(process, "_inheriting", False):  # while a worker imports the script
+        raise SystemExit(1)
 
 
 def _submit(

@@ -30,7 +30,7 @@ from tqdm import tqdm
 from radejax.core import files, manifest
 from radejax.core.archives import wrap_read_errors
 from radejax.core.errors import DataError, UserError, require
-from radejax.core.workers import default_workers, process_pool
+from radejax.core.workers import default_workers, end_rerun, process_pool
 from radejax.data.dataset import FrameSequence, LabelledFrame, LabelledFrames
 from radejax.data.projection import ENCODINGS, decode, encode
 from radejax.geometry.radar_grid import RadarGrid, is_uniform
@@ -343,6 +343,7 @@ def preprocess(
             records of another kind, or a worker process was killed.
         DataError: The manifest is corrupted.
     """
+    end_rerun()
     began = time.perf_counter()
     if not len(frames):
         raise UserError("no frames to preprocess")

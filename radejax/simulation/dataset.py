@@ -27,7 +27,7 @@ from tqdm import tqdm
 
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
-from radejax.core.workers import default_workers, process_pool
+from radejax.core.workers import default_workers, end_rerun, process_pool
 from radejax.data.kradar import motion
 from radejax.data.kradar import write as kradar_write
 from radejax.data.kradar.folders import SIMULATION_MARKER
@@ -81,6 +81,7 @@ def simulate_dataset(
             or a worker was killed.
         DataError: The dataset was finished and files of it are missing.
     """
+    end_rerun()
     root = files.as_path(root)
     if _is_finished(root, options):
         _log.info("Simulated dataset %s is complete: reused.", root)

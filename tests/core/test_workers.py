@@ -93,16 +93,22 @@ def test_errors_of_a_worker_are_raised_here(tmp_path):
         assert submit(os.getpid).result() != os.getpid()  # it continues to work
 
 
-def test_a_script_without_a_guard_names_what_it_lacks(tmp_path):
+@pytest.mark.parametrize("first_line", ["end_rerun()", "pass"])
+def test_a_script_without_a_guard_names_what_it_lacks(tmp_path, first_line):
+    """Once: the workers, which run the script again, have no tracebacks."""
     script = tmp_path / "script.py"
     script.write_text(
         "import os\n"
-        "from radejax.core.workers import process_pool\n"
-        "with process_pool(1, os.chdir, '.') as submit:\n"
-        "    submit(os.getpid).result()\n"
+        "from radejax.core.workers import end_rerun, process_pool\n"
+        f"{first_line}\n"
+        "print('begun')\n"
+        "with process_pool(2, os.chdir, '.') as submit:\n"
+        "    [submit(os.getpid) for _ in range(3)][0].result()\n"
     )
     done = subprocess.run([sys.executable, script], capture_output=True, text=True)
     assert done.returncode == 1
+    assert done.stdout == "begun\n" or first_line == "pass"
+    assert done.stderr.count("Traceback") == 1
     assert "UserError: a worker process ended early" in done.stderr.splitlines()[-1]
     assert '`if __name__ == "__main__":`' in done.stderr.splitlines()[-1]
 
