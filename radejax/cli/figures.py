@@ -187,8 +187,9 @@ def view(
     """
     import tqdm
 
-    from radejax.visualize.recordings import write_recording
+    from radejax.visualize.recordings import check_recording, write_recording
 
+    check_recording(out)
     frames, detector = _open(roots, config, workdir, **part)
     complete = [frame for frame in frames if frame.radar_path]
     if not complete:

@@ -96,6 +96,27 @@ def _to_palette(image: Image.Image) -> Image.Image:
     return image.quantize(palette=palette, dither=Image.Dither.NONE)
 
 
+def check_recording(path: PathLike) -> None:
+    """Raises `UserError` if recordings cannot be written to a file.
+
+    Args:
+        path: File to write.
+
+    Raises:
+        UserError: rerun is not installed, or the suffix is not .rrd.
+    """
+    path = as_path(path)
+    if path.suffix != ".rrd":
+        raise UserError(f"recordings are written as .rrd, got {path.name!r}")
+    try:
+        import rerun  # noqa: F401
+    except ImportError as error:
+        raise UserError(
+            "recordings need rerun, which is not installed: pip install "
+            "'radejax[viewer]' (or pip install rerun-sdk)"
+        ) from error
+
+
 def write_recording(scenes: Iterable[Scene], path: PathLike) -> None:
     """Writes scenes to a recording (.rrd) that `rerun PATH` opens.
 
@@ -106,16 +127,9 @@ def write_recording(scenes: Iterable[Scene], path: PathLike) -> None:
     Raises:
         UserError: rerun is not installed, the suffix is not .rrd, or there are no frames.
     """
-    path = as_path(path)
-    if path.suffix != ".rrd":
-        raise UserError(f"recordings are written as .rrd, got {path.name!r}")
-    try:
-        import rerun as rr
-    except ImportError as error:
-        raise UserError(
-            "recordings need rerun, which is not installed: pip install "
-            "'radejax[viewer]' (or pip install rerun-sdk)"
-        ) from error
+    check_recording(path)
+    import rerun as rr
+
     with atomic_path(path) as temporary:
         stream = rr.RecordingStream("radejax")
         stream.save(temporary)

@@ -2,6 +2,7 @@
 
 import json
 import pathlib
+import sys
 from types import SimpleNamespace
 
 import click.testing
@@ -248,6 +249,11 @@ def test_a_part_of_the_data_is_chosen(
 
     monkeypatch.setattr(check, "check_dataset", look)
     monkeypatch.setattr("radejax.cli.entry.read_frames", look)
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert _run("view", tmp_path).output.startswith("error: recordings need rerun, wh")
+    assert not seen  # no frames are read, and there is no bar
+    checked = "radejax.visualize.recordings.check_recording"
+    monkeypatch.setattr(checked, lambda path: None)
     part = ("--sequences", "1,58", "--weather", "fog", "--weather", "rain")
     for command in (["data", "check"], ["preprocess", "--out", tmp_path], ["view"]):
         assert "opened" in _run(*command, tmp_path, *part).output
