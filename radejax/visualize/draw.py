@@ -233,7 +233,7 @@ def draw_frame(scene: Scene) -> Figure:
         array([12. ,  6.4])
     """
     figure = style.new_figure(12.0, 6.4)
-    bev_ax = figure.add_axes((0.05, 0.085, 0.40, 0.835))
+    bev_ax = figure.add_axes((0.06, 0.085, 0.38, 0.835))
     _draw_ground(scene, ax=bev_ax, label=POWER_LABEL)
     # The color bar of the bird's-eye view holds for both maps.
     limits = bev_ax.collections[0].get_clim()

@@ -58,12 +58,21 @@ def test_a_scan_of_360_degrees_is_drawn_whole():
         GRID,
         azimuth_rad=np.linspace(-np.pi, np.pi, 36, endpoint=False),
         fov_azimuth_rad=np.pi,
+        fov_range_m=118.0,
     )
     truth = Boxes.one_frame([-15.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0], ["Sedan"])
     projection = np.zeros(grid.projection_shape, np.float32)
     drawn = Scene(projection, grid, ground_truth=truth)
     bev, polar = draw.draw_frame(drawn).axes
     assert bev.get_ylim()[0] == pytest.approx(-bev.get_ylim()[1])
+    FigureCanvasAgg(bev.figure).draw()
+    assert "−100" in [t.get_text() for t in bev.get_yticklabels()]
+    (bar,) = bev.child_axes
+    x_m, power, range_m = (
+        ax.yaxis.label.get_window_extent() for ax in (bev, bar, polar)
+    )
+    assert x_m.x0 > 0
+    assert power.x1 < range_m.x0
     lines = [c for c in polar.collections if isinstance(c, LineCollection)]
     widths = [np.ptp(p.vertices[:, 0]) for c in lines for p in c.get_paths()]
     assert max(widths) < 20.0  # degrees, although the box is on both sides of 180
