@@ -124,6 +124,11 @@ _PREDICTIONS = together(
     type=entry.FRACTION,
     help="Do not store predictions below this score.",
 )
+@click.option(
+    "--wanted-precision",
+    type=entry.FRACTION,
+    help="Precision for which score thresholds are chosen. Default: the run's.",
+)
 @click.option("--batch-size", type=entry.COUNT, help="Frames per batch.")
 @click.option(
     "--num-visualizations", type=click.IntRange(0), help="Number of frames to draw."

@@ -42,6 +42,7 @@ from radejax.evaluation.evaluation_set import EvaluationSet, Result
 from radejax.evaluation.html import SceneFigure, write_html
 from radejax.evaluation.kitti import write_kitti
 from radejax.evaluation.results import (
+    HOW_TO_CHOOSE,
     ReportOptions,
     compute_results,
     condition_masks,
@@ -232,7 +233,9 @@ def _console_text(metrics: JsonObject, tables: RunTables) -> str:
     built += [tables.by_weather(protocol, iou) for protocol in others]
     built += [tables.by_protocol(space, iou) for space in SPACES]
     built.append(subset_table(metrics["subsets"], "distance"))
-    built.append(threshold_tables(metrics["thresholds"], options)[0])
+    chosen_on = metrics["thresholds"]["chosen_on"]
+    if chosen_on:
+        built.append(threshold_tables(metrics["thresholds"], options)[0])
     built.append(error_table(metrics["box_errors"]))
     kind = "simulated " if metrics["is_simulated"] else ""
     parts = [
@@ -242,6 +245,7 @@ def _console_text(metrics: JsonObject, tables: RunTables) -> str:
         describe(metrics) + "\n",
         *(f"WARNING: {line}\n" for line in metrics["warnings"]),
         rendered(built, is_simulated=metrics["is_simulated"]),
+        *([] if chosen_on else [f"No score thresholds were chosen: {HOW_TO_CHOOSE}\n"]),
         f"Intervals: {metrics['intervals']}\n",
         "Not part of the numbers, or kept with a remark:",
         *(f"  {count:8d}  {what}" for what, count in metrics["left_out"].items()),
@@ -313,7 +317,8 @@ def _thresholds(
 
     Returns:
         "chosen_on", the frames on which thresholds were chosen, or None; and entries with
-        class, threshold and rates: "chosen" ones, with their "rule", and "rates".
+        class, threshold, rates, and the numbers of matches ("count") and objects: "chosen"
+        ones, with their "rule", and "rates".
     """
     chosen_on = "the validation split"
     if choosing is None and "test" not in splits:
@@ -331,7 +336,9 @@ def _thresholds(
         for i, (rule, threshold) in enumerate(rules.items()):
             entry: analysis.Entry = {"cls": curve.cls, "rule": rule}
             entry |= {"threshold": threshold}
-            entries.append(entry | {name: float(x[i]) for name, x in rates.items()})
+            entry |= {name: float(x[i]) for name, x in rates.items()}
+            count = round(rates["recall"][i] * curve.num_gt)
+            entries.append({**entry, "count": count, "num_gt": curve.num_gt})
     return {
         "chosen_on": None if choosing is None else chosen_on,
         "chosen": [entry for entry in entries if entry["rule"] in scores.RULES],
@@ -352,6 +359,7 @@ def _draw_scores(
     is_matched = data.matched_objects("plain", "free", "3d", iou) >= 0
     rates: dict[str, dict[str, Curve]] = {}
     diagrams: dict[str, dict[str, Curve]] = {}
+    bins: dict[str, list[scores.Reliability]] = {}
     for curve in _class_curves(data, options):
         columns = scores.rates_at(curve, over).items()
         rates[curve.cls] = {name: (over, column) for name, column in columns}
@@ -365,11 +373,16 @@ def _draw_scores(
             found = scores.reliability(x[rows], is_matched[rows])
             label = f"{name}: calibration error {number(found.error, digits=3)}"
             diagrams[curve.cls][label] = found.confidence, found.precision
+            bins.setdefault(curve.cls, []).append(found)
     if not rates:
         return {}
     suffix = f", 3D, IoU {iou:g}{', simulated data' if data.is_simulated else ''}"
     labels = "confidence", "precision"
-    reliability = draw_precision_recall(diagrams, f"Reliability{suffix}", labels)
+    title = f"Reliability{suffix}, with the number of predictions per bin"
+    reliability = draw_precision_recall(diagrams, title, labels)
+    for ax, of_class in zip(reliability.axes, bins.values(), strict=False):
+        for count, x, y in np.hstack(of_class).T:
+            ax.text(x, y + 0.01, f"{count:.0f}", fontsize=6, ha="center", clip_on=True)
     labels = "score threshold", "rate"
     thresholds = draw_precision_recall(rates, f"Score thresholds{suffix}", labels)
     return {"thresholds": thresholds, "reliability": reliability}
@@ -513,15 +526,15 @@ def subset_table(subsets: JsonObject, kind: str) -> Table:
 
 
 def threshold_tables(thresholds: JsonObject, options: ReportOptions) -> list[Table]:
-    """Builds the tables of the rates at chosen score thresholds and at all."""
-    chosen_on = thresholds["chosen_on"] or "no frames, for lack of a validation split"
+    """Builds the tables of the rates at chosen score thresholds, if any, and at all."""
     terms = f"3D at IoU {options.iou_thresholds[0]:g}"
     title = f"Score thresholds in {terms} for the best F1 and a precision of "
-    title += f"{options.wanted_precision:g}, chosen on {chosen_on}"
-    names = ["cls", "threshold", "precision", "recall", "f1"]
+    title += f"{options.wanted_precision:g}, chosen on {thresholds['chosen_on']}"
+    names = ["cls", "threshold", "precision", "recall", "f1", "count", "num_gt"]
     chosen = _table_of("thresholds", title, thresholds["chosen"], [*names, "rule"])
     title = f"Rates at score thresholds in {terms}"
-    return [chosen, _table_of("rates", title, thresholds["rates"], names)]
+    rates = _table_of("rates", title, thresholds["rates"], names[:-2])
+    return [chosen, rates] if thresholds["chosen_on"] else [rates]
 
 
 def error_table(errors: Mapping[str, Mapping[str, float]]) -> Table:

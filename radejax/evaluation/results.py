@@ -43,6 +43,12 @@ from radejax.evaluation.evaluation_set import EvaluationSet, Result, mean_ap
 LEVEL = 0.95
 """Confidence level of all intervals."""
 
+HOW_TO_CHOOSE = (
+    "`radejax evaluate RUN` does so with config.data.validation, or on other labelled "
+    "sequences that --split or --data name"
+)
+"""How to choose score thresholds, which is not done on a test split."""
+
 Metric = Callable[[Boxes, Boxes], Float[np.ndarray, " K"]]
 """Own error of matched boxes: a function of the predictions and their objects, row by row."""
 

@@ -35,6 +35,8 @@ from radejax.core.version import __version__, radejax_commit
 from radejax.data.kradar.labels import LABEL_CLASSES
 from radejax.data.options import CameraOptions, DataOptions
 from radejax.detection.decode import DecodeOptions
+from radejax.evaluation.protocols import RECOMMENDED
+from radejax.evaluation.results import HOW_TO_CHOOSE
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.exported_loader import FORMAT
 from radejax.models.dinorade import IMAGE_BACKBONE
@@ -353,29 +355,34 @@ def _read_checkpoint(path: pathlib.Path, step: Step) -> SavedModel:
             f"{__version__}: train again, or use that version"
         ) from None
     config.check_parts(info["run"].get("parts", {}), folder.parent)
+    identity = _identity(folder.parent, number, info["run"])
+    if fit := _calibration(folder.parent, number):
+        by_class = fit.pop("classes")
+        pairs = [by_class[cls] for cls in config.classes]
+        config = config.replace(decode={"calibration": pairs})
+        identity["probability"] = fit
     return SavedModel(
-        _with_calibration(config, folder.parent, number),
+        config,
         RadarGrid.from_dict(info["grid"]),
         {"params": params, **(state.get("model_state") or {})},
         number,
         {**info["same"], **info["run"]},
         info["run"].get("input"),
-        _identity(folder.parent, number, info["run"]),
+        identity,
     )
 
 
-def _with_calibration(config: Config, workdir: pathlib.Path, step: int) -> Config:
-    """Returns a config with the calibration of the run if it is that of the step."""
+def _calibration(workdir: pathlib.Path, step: int) -> JsonObject | None:
+    """Returns the calibration of the run if it is that of the step."""
     path = workdir / CALIBRATION_FILE
     if not path.exists():
-        return config
+        return None
     found = files.read_object(path, "step", "classes")
     if found["step"] != step:
         text = "%s is of step %s, not %s, and not used: run `radejax calibrate` again"
         _log.warning(text, path, found["step"], step)
-        return config
-    pairs = [found["classes"][cls] for cls in config.classes]
-    return config.replace(decode={"calibration": pairs})
+        return None
+    return found
 
 
 def _identity(workdir: pathlib.Path, step: int, run: JsonObject) -> JsonObject:
@@ -383,12 +390,13 @@ def _identity(workdir: pathlib.Path, step: int, run: JsonObject) -> JsonObject:
     metrics = None
     for evaluation, found in _evaluations(workdir, step):
         if metrics is None and found["split"] == "test":
-            first = found["options"]["protocols"][0]
+            shown = found["options"]["protocols"][0], RECOMMENDED
             aps = {
                 row["name"]: row["ap"]
                 for row in found["ap"]
                 if row["num_gt"]
-                and (row["condition"], row["protocol"]) == ("all", first)
+                and row["condition"] == "all"
+                and row["protocol"] in shown
             }
             names = ("data", "split", "num_frames")
             metrics = {"evaluation": evaluation, **{n: found[n] for n in names}}
@@ -424,7 +432,8 @@ def with_chosen_thresholds(
     """Returns a model of a run with the score thresholds that an evaluation chose.
 
     It is the first evaluation that chose them on the validation split, or else on its own
-    frames. Classes without a threshold keep that of the config, which is logged.
+    frames. Classes without a threshold keep that of the config, which is logged and in the
+    model's identity.
 
     Args:
         saved: Model of the run.
@@ -434,15 +443,14 @@ def with_chosen_thresholds(
     Raises:
         UserError: No evaluation of the step chose thresholds.
     """
-    reports = _evaluations(files.as_path(workdir), saved.step)
-    found = {name: x["thresholds"] for name, x in reports if "thresholds" in x}
+    reports = dict(_evaluations(files.as_path(workdir), saved.step))
+    found = {n: x["thresholds"] for n, x in reports.items() if "thresholds" in x}
     chosen = [name for name, x in found.items() if x["chosen"]]
     chosen.sort(key=lambda name: found[name]["chosen_on"] != "the validation split")
     if not chosen:
         raise UserError(
             f"{workdir}: no evaluation of step {saved.step} chose score thresholds: "
-            "`radejax evaluate RUN` does so with config.data.validation, or on other labelled "
-            "sequences that --split or --data name"
+            f"{HOW_TO_CHOOSE}"
         )
     thresholds = found[chosen[0]]
     rows = [entry for entry in thresholds["chosen"] if entry["rule"] == rule]
@@ -452,9 +460,15 @@ def with_chosen_thresholds(
     least = class_thresholds(by_class, config.classes, usual)
     chosen_on = thresholds["chosen_on"]
     origin = {"rule": rule, "evaluation": chosen[0], "chosen on": chosen_on}
+    if rule == "wanted_precision":
+        origin["rule"] += f" of {reports[chosen[0]]['options'][rule]:g}"
+    origin |= {"matches": {x["cls"]: f"{x['count']} of {x['num_gt']}" for x in rows}}
     _log.info("score thresholds %s of %s", by_class, origin)
-    if kept := [cls for cls in config.classes if cls not in by_class]:
-        _log.warning("%s: no threshold, that of the config is kept", ", ".join(kept))
+    if kept := ", ".join(cls for cls in config.classes if cls not in by_class):
+        origin["not reached, threshold of the config kept"] = kept
+        text = "%s: no threshold by the rule %s, that of the config is kept: choose another "
+        text += "rule or precision (radejax evaluate RUN --wanted-precision)"
+        _log.warning(text, kept, origin["rule"])
     config = config.replace(decode={"score_threshold": least})
     identity = saved.identity | {"thresholds": origin}
     return dataclasses.replace(saved, config=config, identity=identity)

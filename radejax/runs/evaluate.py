@@ -521,13 +521,15 @@ def calibrate_run(workdir: PathLike, **options: Any) -> JsonObject:
             "validation".
 
     Returns:
-        The content of the file: the step, the frames, and temperature and offset by class.
+        The content of the file: the step, the evaluation with data and split, the IoU
+        threshold of a match, and temperature and offset by class.
 
     Raises:
         UserError: There is no validation split, a class has no predictions, or
             `evaluate_run` raises it.
     """
-    report = evaluate_run(workdir, **{"split": "validation", **options})
+    options = {"split": "validation", **options}
+    report = evaluate_run(workdir, **options)
     assert report is not None  # because this is the only process
     iou = report.metrics["options"]["iou_thresholds"][0]
     data = report.data
@@ -537,6 +539,8 @@ def calibrate_run(workdir: PathLike, **options: Any) -> JsonObject:
     require(all(count), f"{report.folder}: predictions to fit", by_class, expected)
     content: JsonObject = {
         "step": report.metrics["step"],
+        "data": report.metrics["data"],
+        "split": files.as_path(options["split"]).name,
         "evaluation": report.folder.name,
         "iou": iou,
         "classes": fit_calibrations(data, iou),

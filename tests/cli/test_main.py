@@ -152,7 +152,7 @@ def test_evaluate_takes_flags_as_its_script_does(
     other = {"roots": ("a", "b", "c"), "label_version": "v1.0"}
     assert seen.pop() == ("run", {"step": "best", "split": "test", "other": other})
     flags = "--roi=0,50,-5,5,-2,6 --min-score=0.01 --iou=0.5 --classes Sedan --name n"
-    flags += " --split=train --protocols=all_point,auc"
+    flags += " --split=train --protocols=all_point,auc --wanted-precision=0.8"
     assert _run("evaluate", "run", *flags.split()).exit_code == 0
     expected = {
         "split": "train",
@@ -162,6 +162,7 @@ def test_evaluate_takes_flags_as_its_script_does(
         "iou_thresholds": (0.5,),
         "classes": ("Sedan",),
         "protocols": ("all_point", "auc"),
+        "wanted_precision": 0.8,
         "run": "n",
     }
     assert seen.pop() == ("run", expected)

@@ -158,7 +158,10 @@ def test_score_thresholds_are_not_chosen_on_a_test_split(scene, tmp_path):
 
     on, chosen, text = thresholds(split)
     assert (on, chosen) == (None, {})
-    assert "chosen on no frames, for lack of a validation split" in text
+    assert (
+        "No score thresholds were chosen: `radejax evaluate RUN` does so with" in text
+    )
+    assert "Rule" not in text
     on, own, _ = thresholds(frames)
     assert on == "the evaluated frames themselves"
     on, chosen, text = thresholds(split, choosing=other)
@@ -173,6 +176,8 @@ def test_score_thresholds_are_not_chosen_on_a_test_split(scene, tmp_path):
         assert row["threshold"] == threshold
         assert row["f1"] == scores.rates_at(here, [threshold])["f1"] <= own[cls]["f1"]
         assert re.search(rf"{cls} +{threshold:.2f} .* best_f1", text)
+        assert row["count"] == round(row["recall"] * here.num_gt) > 0
+        assert row["num_gt"] == here.num_gt
     assert len(chosen) == 2
 
 
@@ -197,3 +202,14 @@ def test_curves_are_drawn_of_classes_that_occur(scene, tmp_path, monkeypatch):
     np.testing.assert_array_equal(panels["Total"][label][0], whole.recall)
     (absent,) = (x for name, x in panels["Total"].items() if "Bicycle" in name)
     assert absent is None
+
+
+def test_bins_of_a_reliability_diagram_have_their_number_of_predictions(scene):
+    data = EvaluationSet(*scene[:2], frames=scene[2])
+    figure = report._draw_scores(data, [], OPTIONS)["reliability"]
+    assert len(figure.axes) == 2
+    for ax in figure.axes:
+        index = data.classes.index(ax.get_title())
+        counts = [int(text.get_text()) for text in ax.texts]
+        assert len(counts) > 5
+        assert sum(counts) == (data.pred.cls == index).sum()

@@ -320,11 +320,13 @@ def test_whatever_is_wrong_in_the_config_is_named(tmp_path):
 
 
 def _evaluation(workdir, name, step, chosen_on, thresholds):
-    chosen = [{"cls": "Sedan", "threshold": 0.9, "rule": "wanted_precision"}]
-    chosen = chosen if thresholds else []
+    row = {"cls": "Sedan", "threshold": 0.9, "rule": "wanted_precision"}
+    chosen = [row | {"count": 2, "num_gt": 88}] if thresholds else []
     for cls, threshold in thresholds.items():
-        chosen.append({"cls": cls, "threshold": threshold, "rule": "best_f1"})
+        row = {"cls": cls, "threshold": threshold, "rule": "best_f1"}
+        chosen.append(row | {"count": 70, "num_gt": 88})
     found = {"step": step, "thresholds": {"chosen_on": chosen_on, "chosen": chosen}}
+    found["options"] = {"wanted_precision": 0.8}
     (workdir / name).mkdir()
     (workdir / name / "metrics.json").write_text(json.dumps(found))
 
@@ -369,3 +371,11 @@ def test_the_thresholds_of_the_validation_split_are_exported(tmp_path, caplog):
     card = (tmp_path / "out" / "README.md").read_text()
     assert "| score threshold Pedestrian | 0.2 |" in card
     assert "| thresholds chosen on | the validation split |" in card
+    assert "| thresholds matches Sedan | 70 of 88 |" in card
+    kept = "| thresholds not reached, threshold of the config kept | Bus or Truck, Mot"
+    assert kept in card
+    found = saved_models.with_chosen_thresholds(model, run, "wanted_precision")
+    assert found.config.decode.score_threshold == (0.9, 0.1, 0.1, 0.1, 0.1)
+    assert found.identity["thresholds"]["rule"] == "wanted_precision of 0.8"
+    assert found.identity["thresholds"]["matches"] == {"Sedan": "2 of 88"}
+    assert "no threshold by the rule wanted_precision of 0.8, that of" in caplog.text

@@ -178,6 +178,7 @@ def test_calibration_of_a_run_is_stored_with_it(
         found = {**truth, "score": np.array([0.9, 0.4])}
         data = EvaluationSet(truth, found, classes=given["classes"])
         metrics = {"step": 7, "options": {"iou_thresholds": [0.3, 0.5]}}
+        metrics["data"] = "drives"
         return SimpleNamespace(data=data, metrics=metrics, folder=tmp_path / "report")
 
     monkeypatch.setattr(evaluate, "evaluate_run", evaluate_run)
@@ -185,6 +186,7 @@ def test_calibration_of_a_run_is_stored_with_it(
     assert given["split"] == "validation"
     stored = json.loads((tmp_path / "calibration.json").read_text())
     assert (stored["step"], stored["evaluation"], stored["iou"]) == (7, "report", 0.3)
+    assert (stored["data"], stored["split"]) == ("drives", "validation")
     assert {n: tuple(x) for n, x in stored["classes"].items()} == found["classes"]
     with pytest.raises(
         UserError, match=r"report: predictions to fit is .*rian': 0}, exp"

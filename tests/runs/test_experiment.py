@@ -155,13 +155,18 @@ def test_a_run_of_two_frames(
     assert origin["data"]["license"] == "Apache-2.0, that of radejax"
     assert origin["metrics"]["split"] == "test"
     assert all("/all/" in name for name in origin["metrics"]["ap"])
+    protocols = {name.split("/")[3] for name in origin["metrics"]["ap"]}
+    assert protocols == {config.evaluation.protocols[0], "all_point"}
     metrics = json.loads((folder / "evaluation" / "metrics.json").read_text())
     assert metrics["thresholds"]["chosen_on"] == "the validation split"
     fits = {cls: [0.5, 1.0] for cls in config.classes}
     for step, expected in ((99, None), (origin["step"], ((0.5, 1.0),) * 5)):
-        content = json.dumps({"step": step, "classes": fits})
+        fit = {"step": step, "split": "all"}
+        content = json.dumps(fit | {"classes": fits})
         (folder / "calibration.json").write_text(content)
-        assert load_model(folder).config.decode.calibration == expected
+        saved = load_model(folder)
+        assert saved.config.decode.calibration == expected
+        assert saved.identity.get("probability") == (fit if expected else None)
     assert "calibration.json is of step 99, not" in caplog.text
     (folder / "calibration.json").unlink()
     report = (folder / "evaluation" / "report.txt").read_text()
