@@ -148,6 +148,8 @@ class Detections(struct.PyTreeNode):
         is_valid: True where a row is a detection and not padding.
         num_truncated: int32 number of peaks before NMS and boxes after it that were
             dropped because of the fixed number of rows, see `detection.decode.decode`.
+        num_invalid: int32 number of frames of the sample whose values cannot be radar data;
+            None if only maps were decoded.
         outputs: `[B, K, ...]` further outputs of the model at the boxes' bins, by name.
         class_names: Names of the detector's classes by class index; static under `jit`.
     """
@@ -157,6 +159,7 @@ class Detections(struct.PyTreeNode):
     classes: Int[jax.Array, "B K"]
     is_valid: Bool[jax.Array, "B K"]
     num_truncated: Int[jax.Array, " B"]
+    num_invalid: Int[jax.Array, " B"] | None = None
     outputs: dict[str, jax.Array] = struct.field(default_factory=dict)
     class_names: tuple[str, ...] = struct.field(pytree_node=False, default=CLASSES)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import copy
 import dataclasses
 import functools
@@ -16,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax.typing import VariableDict
 from jax.sharding import NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
-from jaxtyping import Bool, Float, PyTree, Real, Shaped
+from jaxtyping import Bool, Float, Int, PyTree, Real, Shaped
 
 from radejax import models
 from radejax.core.errors import require
@@ -25,7 +26,13 @@ from radejax.core.options import ClassThresholds
 from radejax.core.structures import Array, Batch, Detections, to_float
 from radejax.data import projection
 from radejax.data.cameras import no_images
-from radejax.data.projection import project_jax, project_tensor, stack_frames
+from radejax.data.projection import (
+    find_invalid,
+    project_jax,
+    project_tensor,
+    stack_frames,
+    unstack_frames,
+)
 from radejax.detection.decode import DecodeOptions, decode
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference import inputs as reading
@@ -42,11 +49,47 @@ from radejax.weights.convert import StateDict
 
 _log = logging.getLogger(__name__)
 
+_NUM_UNCOUNTED = 8
+"""Calls with arrays on a device whose invalid frames may not be counted yet."""
+
 Item = Frames | Batch | tuple[Frames, Images | None, Calibrations | None]
 """Item of `Detector.stream`: frames, or a tuple of frames, image and camera."""
 
-Problems = tuple[Bool[jax.Array, " B"], ...]
-"""Masks of the frames with each of `projection.PROBLEMS`."""
+
+def network_input(
+    frames: Real[Array, "*B R A DE"] | Real[Array, "B D R E A"], grid: RadarGrid
+) -> Float[jax.Array, "*B R A DE"]:
+    """Computes the network's input from projections as they are stored, or from tensors.
+
+    Args:
+        frames: Projections, or radar tensors in linear power.
+        grid: Grid of the sensor or of the model's maps.
+    """
+    if frames.ndim == 5:
+        frames = grid.measured_channels(project_jax(frames))
+    return to_float(frames)
+
+
+def check_frames(
+    frames: Real[jax.Array, "B R A C"] | Real[jax.Array, "B D R E A"], grid: RadarGrid
+) -> tuple[Bool[jax.Array, "P B T"], Int[jax.Array, " B"]]:
+    """Checks whether the values of samples can be radar data.
+
+    Args:
+        frames: Projections of T frames, see `stack_frames`, or radar tensors (T is 1).
+        grid: Grid of the sensor.
+
+    Returns:
+        A mask that is True where a frame has one of the P `projection.PROBLEMS`, and the
+        int32 number of frames of each sample that have any.
+    """
+    if are_tensors := frames.ndim == 5:
+        single = frames[:, None]
+    else:
+        num_frames = frames.shape[-1] // grid.projection_shape[-1]
+        single = unstack_frames(frames, num_frames, grid.num_doppler)
+    problems = jnp.stack(find_invalid(single, are_tensors=are_tensors))
+    return problems, problems.any(axis=0).sum(axis=-1, dtype=jnp.int32)
 
 
 def detect(
@@ -73,10 +116,10 @@ def detect(
         camera: Cameras of the images, or None without images.
         settings: Values that replace those in `options`; they may be traced.
     """
-    if frames.ndim == 5:
-        frames = grid.measured_channels(project_jax(frames))
-    inputs = (to_float(frames),) if image is None else (to_float(frames), image, camera)
-    maps: Any = model.apply(variables, *inputs, train=False)
+    inputs = () if image is None else (image, camera)
+    maps: Any = model.apply(
+        variables, network_input(frames, grid), *inputs, train=False
+    )
     values = {} if settings is None else settings._asdict()
     return decode(maps, grid, options, **values)
 
@@ -109,9 +152,6 @@ class Detector:
             take samples, and `stream` single frames.
         num_radar_only: Number of frames so far that a radar-camera model predicted
             without an image and its calibration. Frames in a `Batch` are not counted.
-        num_invalid_frames: Number of frames so far, passed as NumPy arrays, with values
-            that cannot be radar power (NaN, infinity, negative, constant, decibels). Their
-            detections are meaningless.
 
     Examples:
         >>> detector = Detector.from_workdir("runs/quickstart")  # doctest: +SKIP
@@ -164,15 +204,13 @@ class Detector:
             )
         self._set_batch_sizes(batch_sizes)
         self.variables = jax.device_put(saved.variables, self.replicated)
-        self.num_radar_only = self.num_invalid_frames = 0
+        self._reset_counters()
         self._num_unchecked = 3 if saved.usual_input else 0  # calls
         self._lock = threading.Lock()
         # Every process gets all detections: they are small.
         self._run = jax.jit(run, out_shardings=self.replicated)
-        self._find_invalid = jax.jit(
-            projection.find_invalid,
-            static_argnames="are_tensors",
-            out_shardings=self.replicated,
+        self._check = jax.jit(
+            check_frames, static_argnames="grid", out_shardings=self.replicated
         )
 
     @classmethod
@@ -242,12 +280,16 @@ class Detector:
         """
         other = copy.copy(self)
         other._lock = threading.Lock()
-        other.num_radar_only = other.num_invalid_frames = 0
+        other._reset_counters()
         if variables is not None:
             other.variables = jax.device_put(variables, self.replicated)
         if batch_sizes is not None:
             other._set_batch_sizes(batch_sizes)
         return other
+
+    def _reset_counters(self) -> None:
+        self.num_radar_only = self._num_invalid = 0
+        self._uncounted = collections.deque[tuple[jax.Array, int]]()
 
     def _set_batch_sizes(self, sizes: Sequence[int]) -> None:
         """Sets the batch sizes, rounded up to multiples of the devices of this process."""
@@ -260,7 +302,7 @@ class Detector:
 
     def __call__(
         self,
-        frames: Frames | Batch,
+        frames: Frames | Batch | Inputs,
         image: Images | None = None,
         camera: Calibrations | None = None,
         *,
@@ -294,15 +336,20 @@ class Detector:
         config = self.saved.config
         changes = reading.check_settings(config, score_threshold, nms_iou, roi)
         settings = Settings.of(config, changes)
-        is_checked = True  # the content of a batch was checked when it was created
+        is_counted = True  # the content of a batch was checked when it was created
         if isinstance(frames, Batch):
             inputs = Inputs(frames.projection, frames.image, frames.camera)
         else:
-            radar = self._read_radar(frames, self.num_frames)
-            if self.num_frames > 1:
-                radar = self._stacked(radar)
+            if isinstance(frames, Inputs):  # samples of `stream`
+                radar = frames.radar
+            elif self.num_frames > 1:
+                single = self._projections(self._read_radar(frames, self.num_frames))
+                radar = self._stacked(
+                    single.reshape(-1, self.num_frames, *single.shape[1:])
+                )
             else:
-                is_checked = not isinstance(radar, np.ndarray)
+                radar = self._read_radar(frames)
+                is_counted = False
             images, cameras, missing = self.reader.read_cameras(
                 image, camera, len(radar)
             )
@@ -314,7 +361,7 @@ class Detector:
         largest = self._batch_sizes[-1]
         for start in range(0, len(inputs.radar), largest):
             chunk = jax.tree.map(lambda x, s=start: x[s : s + largest], inputs)
-            parts.append(self._detect(chunk, settings, is_checked))
+            parts.append(self._detect(chunk, settings, is_counted))
         if len(parts) == 1:
             return parts[0]
         found: Detections = jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
@@ -333,18 +380,21 @@ class Detector:
         return radar
 
     def _detect(
-        self, inputs: Inputs, settings: Settings, is_checked: bool
+        self, inputs: Inputs, settings: Settings, is_counted: bool
     ) -> Detections:
         """Detects objects in at most as many frames as the largest batch size."""
         count = len(inputs.radar)
+        is_host = isinstance(inputs.radar, np.ndarray)
         size = next(size for size in self._batch_sizes if size >= count)
         inputs = jax.tree.map(lambda x: self.put(_padded(x, size)), inputs)
-        # The check is awaited after the network was started, so that the device is not idle
-        # meanwhile.
-        problems = None if is_checked else self._problems(inputs.radar)
+        problems, num_invalid = self._check(inputs.radar, self.grid)
         found: Detections = self._run(self.variables, *inputs, settings)
-        if problems is not None:
-            self._count_invalid(problems, count)
+        found = found.replace(num_invalid=num_invalid)
+        if not is_counted:
+            # The check of NumPy arrays is awaited after the network was started, so that
+            # the device is not idle meanwhile. That of arrays on a device is awaited later.
+            self._uncounted.append((problems, count))
+            self._count_invalid(num_left=0 if is_host else _NUM_UNCOUNTED)
         if jax.default_backend() == "cpu" and len(self.sharding.device_set) > 1:
             # With several batches in flight, CPU devices that share cores can fail to
             # synchronize.
@@ -353,49 +403,63 @@ class Detector:
             found = jax.tree.map(lambda x: x[:count], found)
         return found.replace(class_names=self.classes)
 
-    def _problems(self, frames: Real[Array, "B ..."]) -> Problems:
-        found: Problems = self._find_invalid(frames, are_tensors=frames.ndim == 5)
-        return found
+    @property
+    def num_invalid_frames(self) -> int:
+        """Number of frames so far whose values cannot be radar data.
 
-    def _count_invalid(self, problems: Problems, count: int) -> None:
-        """Counts invalid frames among the first `count`, and warns of the first ones."""
-        found = np.array(jax.device_get(problems))[:, :count]  # [problem, frame]
-        num_invalid = int(found.any(axis=0).sum())
-        if num_invalid and not self.num_invalid_frames:
-            first = found[:, found.any(axis=0).argmax()]
-            _log.warning(
-                "%d of %d frames are not linear power or its projection: %s. Their "
-                "detections are meaningless; further ones are counted in "
-                "num_invalid_frames",
-                num_invalid,
-                count,
-                projection.PROBLEMS[first.argmax()],
-            )
+        Their detections are meaningless. Frames in a `Batch` are not counted.
+        """
+        self._count_invalid(num_left=0)
+        return self._num_invalid
+
+    def _count_invalid(self, num_left: int) -> None:
+        """Counts invalid frames, and warns of the first ones.
+
+        Args:
+            num_left: Number of the newest checks that are not awaited.
+        """
         with self._lock:
-            self.num_invalid_frames += num_invalid
+            while len(self._uncounted) > num_left:
+                problems, count = self._uncounted.popleft()
+                found = np.asarray(problems)[:, :count]
+                is_invalid = found.any(axis=0)
+                num_invalid = int(is_invalid.sum())
+                if num_invalid and not self._num_invalid:
+                    first = found[:, is_invalid][:, 0]
+                    _log.warning(
+                        "%d of %d frames are not linear power or its projection: %s. "
+                        "Their detections are meaningless; further ones are counted in "
+                        "num_invalid_frames",
+                        num_invalid,
+                        is_invalid.size,
+                        projection.PROBLEMS[first.argmax()],
+                    )
+                self._num_invalid += num_invalid
 
     # Consecutive frames --------------------------------------------------------------
 
     def _projections(
         self, radar: Real[Array, "B ..."]
     ) -> Float[np.ndarray, "B R A DE"]:
-        """Computes float32 projections of any radar data, and counts invalid NumPy arrays."""
+        """Computes float32 projections of any radar data, and counts invalid frames."""
         placed = jnp.asarray(radar)
-        if isinstance(radar, np.ndarray):
-            self._count_invalid(self._problems(placed), len(placed))
+        self._uncounted.append((self._check(placed, self.grid)[0], len(placed)))
         if placed.ndim == 5:
-            placed = self.grid.measured_channels(project_jax(placed))
-        return np.asarray(to_float(placed))
+            # The maxima of a projection would hide negative power, and can ignore NaN.
+            placed = jnp.where(placed >= 0, placed, jnp.inf)
+        projections = np.asarray(network_input(placed, self.grid))
+        self._count_invalid(num_left=0)
+        return projections
 
-    def _stacked(self, radar: Real[Array, "BT ..."]) -> Float[np.ndarray, "B R A C"]:
-        """Computes the network input of samples, whose frames follow each other."""
-        shape = (-1, self.num_frames, *self.grid.projection_shape)
-        samples = np.moveaxis(self._projections(radar).reshape(shape), 1, 0)
-        return stack_frames(list(samples), self.grid.num_doppler)
+    def _stacked(
+        self, samples: Float[np.ndarray, "B T R A DE"]
+    ) -> Float[np.ndarray, "B R A C"]:
+        """Computes the network input of samples."""
+        return stack_frames(list(np.moveaxis(samples, 1, 0)), self.grid.num_doppler)
 
     def _samples(
         self, frames: Frames, history: Float[np.ndarray, "T1 R A DE"] | None
-    ) -> tuple[Float[jax.Array, "B T R A DE"], Float[np.ndarray, "T1 R A DE"]]:
+    ) -> tuple[Inputs, Float[np.ndarray, "T1 R A DE"]]:
         """Returns the samples of consecutive frames, and the preceding ones of the next.
 
         Args:
@@ -408,8 +472,7 @@ class Detector:
             history = np.repeat(new[:1], past, axis=0)
         known = np.concatenate([history, new])
         rows = np.arange(len(new))[:, None] + np.arange(self.num_frames)
-        # Invalid frames were counted; those of arrays on a device are not counted again.
-        return jnp.asarray(known[rows]), known[-past:]
+        return Inputs(self._stacked(known[rows])), known[-past:]
 
     def stream(self, frames: Iterable[Item], **settings: Any) -> Iterator[Detections]:
         """Yields the detections of items in order, with up to two items in flight.
@@ -465,7 +528,7 @@ class Detector:
         if isinstance(sample, int):
             made = self.replace()
             made._num_unchecked = 0
-            made.num_invalid_frames = 1  # no warning of the frames, which are empty
+            made._num_invalid = 1  # no warning of the frames, which are empty
             count = sample
             steps = (self.num_frames,) if self.num_frames > 1 else ()
             sample = np.zeros((count, *steps, *self.grid.projection_shape), np.float32)

@@ -31,13 +31,11 @@ from radejax import models
 from radejax.core import files
 from radejax.core.errors import UserError, require
 from radejax.core.files import JsonObject
-from radejax.core.structures import to_float
 from radejax.core.version import __version__, radejax_commit
 from radejax.data.cameras import no_images
-from radejax.data.projection import find_invalid, project_jax, unstack_frames
 from radejax.geometry.camera import Camera
 from radejax.inference import exported_loader
-from radejax.inference.detector import Detector
+from radejax.inference.detector import Detector, check_frames, network_input
 from radejax.inference.inputs import Settings
 from radejax.inference.saved import CONFIG_FILE, WEIGHTS_FILE, save_model
 from radejax.models.dinorade import IMAGE_BACKBONE
@@ -221,7 +219,7 @@ def _readme(
         detector: The detector.
         shape: Shape of one frame of the input.
         kind: Format of the folder. Parts of the text are for some formats, "all", or models
-            of several "frames" or in "bfloat16".
+            of several "frames", "calibrated" or in "bfloat16".
         content: Content of `config.json`.
         names: Names of the files.
     """
@@ -234,7 +232,8 @@ def _readme(
     every, *parts = re.split(r"<!-- (.*) -->\n", _MODEL_CARD.read_text())
     pairs = zip(parts[::2], parts[1::2], strict=True)
     frames = "frames" if detector.num_frames > 1 else ""
-    tags = {kind, "all", frames, config.model.dtype}
+    calibrated = "calibrated" if config.decode.calibration else ""
+    tags = {kind, "all", frames, calibrated, config.model.dtype}
     own = [text for names, text in pairs if tags & set(names.split())]
     use = "`load.py`, or " if "load.py" in names else ""
     listed = {n: x for n, x in (_OF_MODELS | _OF_PROGRAMS).items() if n in names}
@@ -248,6 +247,9 @@ def _readme(
         opset=_OPSET,
         runtime=_SMALLEST_RUNTIME,
         count=config.decode.max_detections,
+        z="LiDAR"
+        if config.data.format == "kradar"
+        else "origin of the training's labels",
         left_out=_LEFT_OUT if content["left_out"] else "nothing",
         origin=_SIMULATED if is_simulated else _MEASURED,
         identity=_origin(content),
@@ -370,12 +372,7 @@ def _detect(
     image, camera = (rest[0], Camera(**rest[1])) if rest else (None, None)
     function = detector.detect_function()
     found = function(variables, radar, image, camera, settings)
-    if are_tensors := radar.ndim == 5:
-        frames = radar[:, None]
-    else:
-        frames = unstack_frames(radar, detector.num_frames, detector.grid.num_doppler)
-    problems = jnp.stack(find_invalid(frames, are_tensors=are_tensors))
-    num_invalid = problems.any(axis=0).sum(axis=-1, dtype=jnp.int32)
+    _, num_invalid = check_frames(radar, detector.grid)
     results = vars(found) | {"num_invalid": num_invalid}
     own = dict(sorted(found.outputs.items()))
     return {name: results[name] for name in RESULTS} | own
@@ -505,8 +502,8 @@ def _onnx_files(
     def network(*arrays: jax.Array) -> list[jax.Array]:
         radar, *rest = jax.tree.unflatten(tree, arrays)
         camera = [rest[0], Camera(**rest[1])] if rest else []
-        projection = project_jax(radar) if radar.ndim == 5 else to_float(radar)
-        maps: Any = detector.model.apply(variables, projection, *camera, train=False)
+        levels = network_input(radar, detector.grid)
+        maps: Any = detector.model.apply(variables, levels, *camera, train=False)
         return [maps.heatmap_logits, maps.box_params]
 
     def program(*arrays: jax.Array) -> dict[str, jax.Array]:

@@ -1,14 +1,14 @@
-"""Detects objects in radar data without radejax: python load.py array.npy [...].
+"""Detects objects in radar data without radejax: python load.py ARRAY.npy [...].
 
 It needs `pip install jax flatbuffers`, or `pip install onnxruntime` in a folder with an
 ONNX program. README.md describes the arrays, here of one frame.
 """
 
+import argparse
 import hashlib
 import json
 import pathlib
 import re
-import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -29,9 +29,9 @@ def read_folder(folder: pathlib.Path) -> tuple[dict[str, Any], dict[str, bytes]]
         FileNotFoundError: A file is missing.
     """
     config = json.loads((folder / "config.json").read_text())
-    if config.get("format") != FORMAT:
+    if config["format"] != FORMAT:
         raise ValueError(
-            f"{folder}: format {config.get('format')!r}, and this load.py reads {FORMAT!r}: "
+            f"{folder}: format {config['format']!r}, and this load.py reads {FORMAT!r}: "
             "export the model again, or use the load.py of that folder"
         )
     data = {name: (folder / name).read_bytes() for name in config["sha256"]}
@@ -63,11 +63,33 @@ def check_jax(found: str, versions: Mapping[str, str]) -> None:
         warnings.warn(f"{text}: if loading fails, export again", stacklevel=3)
 
 
-def stablehlo(config: dict[str, Any], data: dict[str, bytes], device: Any) -> Run:
+def checked(rows: Mapping[str, Mapping[str, Any]], name: str, value: Any) -> np.ndarray:
+    """Returns an input as an array, in which floats of another size are converted.
+
+    Args:
+        rows: Rows of inputs.json by name.
+        name: Name of the input.
+        value: The input.
+
+    Raises:
+        ValueError: The input has another shape or dtype.
+    """
+    array = np.asarray(value)
+    shape, dtype = rows[name]["shape"], np.dtype(rows[name]["dtype"])
+    fits = array.dtype == dtype or array.dtype.kind == dtype.kind == "f"
+    sizes = [m if n is None else n for n, m in zip(shape, array.shape, strict=False)]
+    if not fits or len(shape) != array.ndim or tuple(sizes) != array.shape:
+        expected = f"{dtype} {shape}".replace("None", "any")
+        found = f"{array.dtype} {list(array.shape)}"
+        raise ValueError(f"{name} is {found}, expected {expected}")
+    return array.astype(dtype, copy=False)
+
+
+def stablehlo(versions: Mapping[str, str], data: dict[str, bytes], device: Any) -> Run:
     """Returns the program for JAX, with its weights on a device.
 
     Args:
-        config: Content of config.json.
+        versions: Versions of JAX of config.json.
         data: Contents of the files by name.
         device: Device of JAX; its default if None.
 
@@ -77,7 +99,7 @@ def stablehlo(config: dict[str, Any], data: dict[str, bytes], device: Any) -> Ru
     import jax
     import jax.export  # not a part of `import jax`
 
-    check_jax(jax.__version__, config["jax"])
+    check_jax(jax.__version__, versions)
     run = jax.jit(jax.export.deserialize(bytearray(data["detector.stablehlo"])).call)
     weights = jax.device_put(read_weights(data["model.safetensors"]), device)
 
@@ -128,44 +150,56 @@ def load(
 
     Raises:
         FileNotFoundError: A file is missing.
-        ValueError: The folder has another format or no program, or a file is corrupted.
+        ValueError: The folder has another format or no program, or a file is corrupted. The
+            function raises it for an input of another shape or dtype, and for settings
+            out of their range.
         ImportError: The version of JAX is too old for the program.
     """
     folder = pathlib.Path(folder).expanduser()
-    config, data = read_folder(folder)
+    try:
+        config, data = read_folder(folder)
+        decode = config["config"]["decode"]
+        defaults = {name: decode[name] for name in ("score_threshold", "nms_iou")}
+        defaults["roi"] = decode["roi"] or [-np.inf, np.inf] * 3
+        classes = len(config["config"]["classes"])
+        versions = config["jax"] if "detector.stablehlo" in data else {}
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
+        text = f"{folder / 'config.json'}: corrupted, {error!r}: export the model again"
+        raise ValueError(text) from None
     if "detector.onnx" in data:
         run = onnx(data, session_options)
     elif "detector.stablehlo" in data:
-        run = stablehlo(config, data, device)
+        run = stablehlo(versions, data, device)
     else:
         raise ValueError(f"{folder}: only weights, expected --format stablehlo or onnx")
-    decode = config["config"]["decode"]
-    defaults = {name: decode[name] for name in ("score_threshold", "nms_iou")}
-    defaults["roi"] = decode.get("roi") or [-np.inf, np.inf] * 3
-    classes = len(config["config"]["classes"])
+    rows = {row["name"]: row for row in json.loads(data["inputs.json"])}
+    names = [name for name in ("projection", "tensor", "image") if name in rows]
 
-    def detect(*inputs: object, **settings: object) -> dict[str, Any]:
+    def detect(*inputs: Any, **settings: object) -> dict[str, Any]:
         if unknown := set(settings) - set(defaults):
             raise TypeError(f"unknown {unknown}, expected {sorted(defaults)}")
         given = {**defaults, **settings}
         values = [np.asarray(x, np.float32) for x in given.values()]
+        if values[0].ndim == 0:
+            values[0] = np.repeat(values[0], classes)
+        values = [checked(rows, n, x) for n, x in zip(given, values, strict=True)]
         for name, value in zip(given, values[:2], strict=False):
             if not ((value >= 0) & (value <= 1)).all():  # also if it is NaN
                 raise ValueError(f"{name} {value}: expected a number from 0 to 1")
-        if values[0].shape not in ((), (classes,)):
-            expected = f"one number, or {classes}, one per class"
-            raise ValueError(f"score_threshold {values[0]}: expected {expected}")
-        values[0] = np.broadcast_to(values[0], classes)
         if not (values[2][::2] < values[2][1::2]).all():
             raise ValueError(f"roi {values[2]}: expected x0 < x1, y0 < y1, z0 < z1")
-        return run(inputs, values)
+        arrays = [checked(rows, n, x) for n, x in zip(names, inputs, strict=False)]
+        return run((*arrays, *inputs[len(names) :]), values)
 
     return detect
 
 
 if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("arrays", nargs="+", metavar="ARRAY.npy", help="one frame each")
+    paths = parser.parse_args().arrays
     detect = load()
-    for path in sys.argv[1:]:
+    for path in paths:
         array = np.load(path)
         levels = np.float32(1 / 255 if array.dtype == np.uint8 else 1)  # of records
         result = detect(array.astype(np.float32)[None] * levels)

@@ -42,7 +42,7 @@ def export_int8(
     roots: Sequence[str] | None = None,
     **settings: Any,
 ) -> tuple[int, list[str]]:
-    """Writes an ONNX export in int8, whose README has the APs of float32 and int8.
+    """Writes an ONNX export in int8, whose README and config have the APs of both types.
 
     The ranges of the activations are those on frames of the validation split, or of the
     train split if nothing is held out. The APs are those on frames of the test split, with
@@ -74,10 +74,20 @@ def export_int8(
     exact = _aps(folder, config, data, frames)
     num_bytes -= _quantize(folder, data, known)
     quantized = _aps(folder, config, data, frames)
+    options = report_options(config)
+    (protocol, *_), data_name = options.protocols, data.describe()["name"]
+    least = options.settings_of(protocol)["score_threshold"]
+    calibrated_on = f"{len(known)} frames of the {split} split"
+    evaluated_on = f"{len(frames)} frames of the test split of {data_name}, "
+    evaluated_on += f"by {protocol} with scores above {least:g}"
+    content = files.read_object(folder / CONFIG_FILE)
+    aps = {"float32": exact, "int8": quantized}
+    content["int8"] = {"ranges": calibrated_on, "evaluated": evaluated_on, "ap": aps}
+    files.write_json(folder / CONFIG_FILE, content)
     lines = [
         "Convolutions are computed in int8: weights in 8 bits per output channel, and",
-        f"activations in 8 bits, with the ranges on {len(known)} frames of the {split} split.",
-        f"APs by {report_options(config).protocols[0]} on {len(frames)} frames of the test split:",
+        f"activations in 8 bits, with the ranges on {calibrated_on}.",
+        f"APs on {evaluated_on}:",
         "",
         "| class, boxes, threshold | float32 | int8 |\n|---|---|---|",
         *(f"| {n} | {x:.1f} | {quantized[n]:.1f} |" for n, x in exact.items()),

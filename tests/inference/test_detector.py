@@ -192,10 +192,45 @@ def test_invalid_frames_are_counted_and_warned_of_once(
     levels = 184.3 * projections[:3] - 1.2
     assert count(levels)[0] == 3
     assert count(0 * tesseracts[:3], 0 * projections[:3])[0] == 6
-    # Arrays on a device are not checked, nor are the frames of a warm-up counted.
-    assert count((255 * projections[:3]).astype(np.uint8), jnp.asarray(levels))[0] == 0
+    # The frames of a warm-up are not counted.
+    assert count((255 * projections[:3]).astype(np.uint8))[0] == 0
     made = detector.replace(batch_sizes=(1,)).warmup()
     assert (made.num_invalid_frames, caplog.text) == (0, "")
+
+
+def test_invalid_frames_of_arrays_on_a_device_are_counted_later(
+    detector, projections, caplog
+):
+    made = detector.replace(batch_sizes=(1, 4))
+    spoiled = projections[:3].copy()
+    spoiled[1, 1, 2, 2] = np.nan
+    device = jnp.asarray(spoiled)
+    assert made(device).num_invalid.tolist() == [0, 1, 0]
+    assert caplog.text == ""  # it is not awaited in the call
+    assert made.num_invalid_frames == 1
+    assert caplog.text.count("1 of 3 frames are not linear power") == 1
+    for _ in range(10):
+        made(device)
+    assert made._num_invalid == 3  # that of the last eight calls is not awaited
+    assert made.num_invalid_frames == 11
+    assert made(projections[:3]).num_invalid.tolist() == [0, 0, 0]
+
+
+def test_invalid_frames_of_samples_are_counted_once(tesseracts, projections):
+    two = small.detector(num_frames=2, score_threshold=0.3, batch_sizes=(1, 4))
+    pairs = np.stack([projections[:4], projections[1:]], 1)
+    pairs[1:3, 0] = pairs[2, 1] = np.nan
+    for given in (pairs, jnp.asarray(pairs)):
+        made = two.replace()
+        assert made(given).num_invalid.tolist() == [0, 1, 2, 0]
+        assert made.num_invalid_frames == 3
+    # The second frame, with negative power, is in two samples of a stream.
+    spoiled = tesseracts[:4].copy()
+    spoiled[1, 0, 0, 0, 0] = -1
+    made = two.replace()
+    found = made.stream([*spoiled[:2], jnp.asarray(spoiled[2:])])
+    assert [x.num_invalid.tolist() for x in found] == [[0], [1], [1, 0]]
+    assert made.num_invalid_frames == 1
 
 
 def test_input_unlike_that_of_the_training_is_warned_of_once(

@@ -18,11 +18,13 @@ from jax.extend import backend
 from jaxlib import _jax as jaxlib_client
 
 import radejax
-from radejax import DataError, Detector, UserError, load_model
+from radejax import DataError, Detector, UserError, load_model, models
 from radejax.core.structures import MIN_SIZE_M
 from radejax.data.projection import encode
 from radejax.geometry.camera import stack_cameras
 from radejax.inference import export, exported_loader
+from radejax.inference.detector import network_input
+from radejax.inference.saved import SavedModel
 
 from .. import small_models as small
 
@@ -126,6 +128,9 @@ def test_a_fresh_process_without_radejax_finds_the_same_boxes(tmp_path):
     command = [sys.executable, folder / "load.py", tmp_path / "uint8.npy"]
     printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     assert printed.count("\n") > 3  # a record of uint8 has objects as well
+    command[2] = "--help"
+    printed = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert "usage: load.py [-h] ARRAY.npy [ARRAY.npy ...]" in printed
     again = Detector.from_workdir(folder, batch_sizes=(4,))
     _check(found, "3", again(projection))
 
@@ -136,6 +141,8 @@ def test_a_program_of_two_frames_takes_the_channels_of_both(tmp_path):
     rows = json.loads((tmp_path / "inputs.json").read_text())
     assert rows[-4]["shape"] == [None, 16, 14, 10]
     card = (tmp_path / "README.md").read_text()
+    assert "`probability`" not in card
+    assert "with z from the\nLiDAR." in card
     assert "Projections [B, 16, 14, 10] float32" in card
     assert "channels of all 2 frames, oldest first" in card
     frames = small.projections(2)
@@ -162,6 +169,36 @@ def test_own_outputs_are_results_of_a_program(tmp_path):
     expected = detector(projection).outputs["velocity"]
     np.testing.assert_allclose(found["velocity"], expected, atol=1e-5)
     assert np.abs(expected).max() > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("axis", ["doppler", "elevation"])
+def test_an_onnx_file_begins_with_the_tensor_of_a_radar_without_an_axis(axis, tmp_path):
+    pytest.importorskip("jax2onnx")
+    runtime = pytest.importorskip("onnxruntime")
+    none = np.array([])
+    grid = small.uneven_grid(elevation_rad=np.linspace(-0.1, 0.1, 3))
+    grid = dataclasses.replace(
+        grid, **{{"doppler": "doppler_mps", "elevation": "elevation_rad"}[axis]: none}
+    )
+    bins = {"doppler_bins": grid.num_doppler, "elevation_bins": grid.num_elevation}
+    config = small.radar_config().replace(model=bins)
+    model = models.build(config.model)
+    variables = small.drawn(model, np.zeros((1, *grid.projection_shape), np.float32))
+    saved = SavedModel(config, grid, variables)
+    detector = Detector(saved, score_threshold=0.1, batch_sizes=(1,))
+    rng = np.random.default_rng(0)
+    tensor = 10 ** rng.uniform(2, 15, (1, *grid.shape_drea)).astype(np.float32)
+    options = {"kind": "onnx", "radar_input": "tensor"}
+    export.export(detector, tmp_path, **options)
+    wanted = detector(tensor)
+    found = exported_loader.load(tmp_path)(tensor)
+    _check({f"{name}_": x for name, x in found.items()}, "", wanted)
+    session = runtime.InferenceSession(tmp_path / "network.onnx")
+    logits, _ = session.run(None, {"tensor": tensor})
+    levels = network_input(tensor, grid)
+    maps = jax.jit(model.apply)(variables, levels)
+    np.testing.assert_allclose(logits, maps.heatmap_logits, atol=1e-4)
 
 
 @pytest.mark.slow
@@ -200,7 +237,11 @@ def test_a_program_of_one_batch_size_and_platform_has_static_shapes(tmp_path):
     assert [list(x.shape) for x in inputs] == [row["shape"] for row in rows]
     found = _run_bytecode(tmp_path, inputs)
     wanted = detector(projection, roi=(-99, 99) * 3)
-    expected = vars(wanted) | wanted.outputs | {"num_invalid": np.zeros(2)}
+    card = (tmp_path / "README.md").read_text()
+    assert (
+        "`probability` [B, K] is the estimated probability that a box matches" in card
+    )
+    expected = vars(wanted) | wanted.outputs
     assert (wanted.outputs["probability"] > wanted.scores).any()
     rows = json.loads((tmp_path / "outputs.json").read_text())
     for row, value in zip(rows, found, strict=True):
@@ -245,10 +286,40 @@ def test_a_program_that_begins_with_the_tensor(tmp_path):
         with pytest.raises(ValueError, match=r"roi .* expected x0 < x1"):
             detect(small.projections(1), roi=region)
     for name, value in (("score_threshold", np.nan), ("nms_iou", 1.5)):
-        with pytest.raises(ValueError, match=f"{name} {value}: expected a number from"):
+        with pytest.raises(
+            ValueError, match=rf"{name} \[?{value}.*: expected a number"
+        ):
             detect(small.projections(1), **{name: value})
-    with pytest.raises(ValueError, match="expected one number, or 5, one per class"):
-        detect(small.projections(1), score_threshold=[0.5, 0.5])
+    projection = small.projections(1)
+    for given, settings, text in (
+        (projection, {"score_threshold": [0.5, 0.5]}, r"\[2\], expected float32 \[5\]"),
+        (projection, {"nms_iou": [0.5]}, r"nms_iou is float32 \[1\], expected"),
+        (
+            projection,
+            {"roi": (0, 9) * 2},
+            r"roi is float32 \[4\], expected float32 \[6",
+        ),
+        (encode(projection, "uint8"), {}, r"n is uint8 .*, expected float32 \[any, 16"),
+        (projection[0], {}, r"projection is float32 \[16, 14, 5\], expected float32"),
+        (projection[:, :8], {}, r"float32 \[1, 8, 14, 5\], expected float32 \[any, 16"),
+    ):
+        with pytest.raises(ValueError, match=text):
+            detect(given, **settings)
+    half = detect(projection.astype(np.float16))  # converted
+    np.testing.assert_allclose(half["scores"], detect(projection)["scores"], atol=1e-2)
+    config = (tmp_path / "config.json").read_text()
+    for damaged in (
+        "{",
+        "[]",
+        config.replace('"sha256"', '"sha"'),
+        config.replace("{", "["),
+    ):
+        (tmp_path / "config.json").write_text(damaged)
+        with pytest.raises(
+            ValueError, match=r"config\.json: corrupted, .*: export the"
+        ):
+            exported_loader.load(tmp_path)
+    (tmp_path / "config.json").write_text(config)
     _, left_out = export.export(small.detector("camera"), tmp_path, kind="huggingface")
     assert left_out == ["params/image_backbone"]
     assert "DINOv3" in (tmp_path / "README.md").read_text()
@@ -268,7 +339,7 @@ def _spoiled(frames, are_tensors):
 
 
 def _check_invalid(detector, folder, radar_input, kind):
-    """Compare `num_invalid` of a program with what the detector counts."""
+    """Compare `num_invalid` of a program with that of the detector."""
     rng = np.random.default_rng(0)
     frames = small.projections(1)
     if are_tensors := radar_input == "tensor":
@@ -278,11 +349,9 @@ def _check_invalid(detector, folder, radar_input, kind):
     export.export(detector, folder, platforms=("cpu",), **options)
     detect = exported_loader.load(folder)
     for name, given in _spoiled(frames, are_tensors).items():
-        counting = detector.replace()
-        counting(given)
+        expected = detector(given).num_invalid.tolist()
         found = np.asarray(detect(given)["num_invalid"]).tolist()
-        assert found == [int(name != "valid")], name
-        assert counting.num_invalid_frames == found[0], name
+        assert found == [int(name != "valid")] == expected, name
 
 
 @pytest.mark.parametrize("radar_input", export.INPUTS)
@@ -433,7 +502,7 @@ def test_wrong_options_are_named_before_anything_is_written(tmp_path, monkeypatc
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["radar", "camera"])
-def test_onnx_files_give_the_same_boxes(kind, tmp_path):
+def test_onnx_files_give_the_same_boxes(kind, tmp_path, monkeypatch):
     pytest.importorskip("jax2onnx")
     runtime = pytest.importorskip("onnxruntime")
     onnx = pytest.importorskip("onnx")
@@ -473,6 +542,11 @@ def test_onnx_files_give_the_same_boxes(kind, tmp_path):
     maps = jax.jit(lambda v, *x: detector.model.apply(v, *x, train=False))(
         detector.variables, *arguments
     )
+    if kind == "radar":  # of one frame, which is as good in a batch of two
+        code = _documented("deploy.md", "session.get_outputs()").replace("onnx/", "")
+        monkeypatch.chdir(tmp_path)
+        exec(code, given := {"projection": arguments[0]})
+        assert given["detections"].keys() == {*export.RESULTS, "probability"}
     rows = json.loads((tmp_path / "inputs.json").read_text())
     options = runtime.SessionOptions()
     options.intra_op_num_threads = 1
@@ -517,9 +591,9 @@ def test_a_program_in_bfloat16_is_lowered_for_accelerators(tmp_path):
     assert "bfloat16" not in (tmp_path / "README.md").read_text()
 
 
-def _documented(part):
-    """Return the code block of docs/exports.md that contains a text."""
-    page = pathlib.Path(__file__).parents[2] / "docs" / "exports.md"
+def _documented(page, part):
+    """Return the code block of a page that contains a text."""
+    page = pathlib.Path(__file__).parents[2] / "docs" / page
     blocks = page.read_text(encoding="utf-8").split("```python\n")[1:]
     (code,) = (code for block in blocks if part in (code := block.split("```")[0]))
     return code
@@ -533,7 +607,7 @@ def test_the_documented_decoder_finds_the_boxes_before_nms(tmp_path, monkeypatch
     outputs = [np.asarray(maps.heatmap_logits), np.asarray(maps.box_params)]
     network = SimpleNamespace(run=lambda *_: outputs)
     found = {"network": network, "projection": projection}
-    exec(_documented("sliding_window_view"), found)
+    exec(_documented("exports.md", "sliding_window_view"), found)
     settings = {"score_threshold": 0.3, "nms_iou": 1.0, "roi": (-99, 99) * 3}
     wanted = detector(projection, **settings)
     order = np.argsort(-found["best"], kind="stable")[: wanted.is_valid.sum()]

@@ -1,5 +1,6 @@
 """An export in int8 of a small model on simulated data."""
 
+import json
 import pathlib
 import re
 from typing import Any
@@ -82,7 +83,11 @@ def test_convolutions_are_int8_and_the_readme_has_both_aps(
     card = (tmp_path / "README.md").read_text(encoding="utf-8")
     assert "Convolutions are computed in int8" in card
     assert "with the ranges on 2 frames of the train split" in card
-    assert "on 3 frames of the test split" in card
+    text = "on 3 frames of the test split of simulated, by "
+    assert re.search(text + r"\w+ with scores above 0.(05|3):", card)
+    entry = json.loads((tmp_path / "config.json").read_text())["int8"]
+    assert entry["ranges"] == "2 frames of the train split"
+    assert entry["ap"]["int8"].keys() == entry["ap"]["float32"].keys()
     rows = re.findall(r"\| mean, (bev|3d), IoU 0.3 \| [0-9.]+ \| [0-9.]+ \|", card)
     assert rows == ["bev", "3d"]
     # The loader checks the checksums of the new files.
