@@ -57,12 +57,12 @@ Item = Frames | Batch | tuple[Frames, Images | None, Calibrations | None]
 
 
 def network_input(
-    frames: Real[Array, "*B R A DE"] | Real[Array, "B D R E A"], grid: RadarGrid
-) -> Float[jax.Array, "*B R A DE"]:
+    frames: Real[Array, "B _ _ _"] | Real[Array, "B _ _ _ _"], grid: RadarGrid
+) -> Float[jax.Array, "B R A DE"]:
     """Computes the network's input from projections as they are stored, or from tensors.
 
     Args:
-        frames: Projections, or radar tensors in linear power.
+        frames: `[B, R, A, DE]` projections, or `[B, D, R, E, A]` tensors in linear power.
         grid: Grid of the sensor or of the model's maps.
     """
     if frames.ndim == 5:
@@ -71,12 +71,13 @@ def network_input(
 
 
 def check_frames(
-    frames: Real[jax.Array, "B R A C"] | Real[jax.Array, "B D R E A"], grid: RadarGrid
+    frames: Real[jax.Array, "B _ _ _"] | Real[jax.Array, "B _ _ _ _"], grid: RadarGrid
 ) -> tuple[Bool[jax.Array, "P B T"], Int[jax.Array, " B"]]:
     """Checks whether the values of samples can be radar data.
 
     Args:
-        frames: Projections of T frames, see `stack_frames`, or radar tensors (T is 1).
+        frames: `[B, R, A, C]` projections of T frames, see `stack_frames`, or
+            `[B, D, R, E, A]` radar tensors (T is 1).
         grid: Grid of the sensor.
 
     Returns:
