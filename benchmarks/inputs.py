@@ -1,4 +1,4 @@
-"""Inputs of the benchmarks, and the steps of the reference implementation.
+"""Inputs of the benchmarks, and the steps of the authors' code.
 
 Sizes are those of K-Radar. Values are random where they do not affect the time.
 """
@@ -157,7 +157,7 @@ def labelled(records):
 
 
 def write_npy(folder, count, grid):
-    """Writes random float64 projections `[D+E, R, A]` like the released code; returns paths."""
+    """Writes random float64 projections `[D+E, R, A]` like the authors' code; returns paths."""
     r, a, c = grid.projection_shape
     stored = np.random.default_rng(0).random((c, r, a))
     paths = [folder / f"DERA_tesseract_{i:05d}.npy" for i in range(count)]

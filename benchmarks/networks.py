@@ -369,7 +369,7 @@ def attention(machine):
 
 
 def detector(machine):
-    """Tesseracts in host memory to boxes, compared with the steps of the released code."""
+    """Tesseracts in host memory to boxes, compared with the steps of the authors' code."""
     name = "tesseract to boxes"
     for dtype, size in settings(machine, name, DETECTOR):
         config, model, _ = network("radenet.py", dtype)

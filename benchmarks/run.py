@@ -1,4 +1,4 @@
-"""Runs all benchmarks that fit this machine, in alternation with the reference implementations.
+"""Runs all benchmarks that fit this machine, in alternation with PyTorch and the authors' code.
 
     python benchmarks/run.py                       # everything
     python benchmarks/run.py --only radenet tpm    # some

@@ -9,7 +9,7 @@ The argument is a list of options, at most one of each group:
 - variant: `r` radar-only (a RADE-Net with the dual stem), `rc` with camera and without elevation
   weights, `rcw` (default) the whole model, `rcw_resnet50` with a ResNet-50, whose last stage is
   trained, instead of DINOv3; `rcw_dinov2` with DINOv2 ViT-S/14, which is not in the paper.
-- preset: `paper` or `official` (the released code with these values, including its geometry). The
+- preset: `paper` or `official` (the authors' code with these values, including its geometry). The
   paper's models were not trained with `official`: the released settings for radar and camera
   (`params_radcam.py`) are a copy of the radar-only ones and lack keys that the code reads. The
   default follows the paper, but with the released attention block in the radar branch, with
@@ -79,7 +79,7 @@ PRESETS = {
         "data.camera.calibration": "common",
     },
 }
-"""Fields in which the paper and the released code differ, in addition to RADE-Net's."""
+"""Fields in which the paper and the authors' code differ, in addition to RADE-Net's."""
 
 CLASS_SETS = ("all", "sedan")
 
@@ -99,7 +99,7 @@ def get_config(arg: str | None = None) -> Config:
     if preset is not None:
         config = config.with_fields(radenet.PRESETS[preset] | PRESETS[preset])
     if preset == "official":
-        # The released code only scales the images of its ResNet to [0, 1].
+        # The authors' code only scales the images of its ResNet to [0, 1].
         is_standardized = variant != "rcw_resnet50"
         config = config.replace(
             model={

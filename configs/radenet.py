@@ -9,7 +9,7 @@ The argument is a list of options, at most one of each group:
 - variant: `base`, `cbam`, `cbam_heads`, `model` (default), `stem`, `expand`; the rows of Table III,
   from no attention, plain neck and small heads to the wide decoder. `no_cbam` is the full model
   without attention, the fourth row of the table, see below.
-- preset: `paper` or `official` (what the released code runs, including its padded and stretched
+- preset: `paper` or `official` (what the authors' code runs, including its padded and stretched
   azimuth axis). The default follows the paper, but with the released attention block, with
   regression losses at the objects' own bins, and with the raw yaw vector in NMS.
 - sigma: `sigma3`, `sigma0.75` (in bins), `adaptive`, `anisotropic` (from the size of the object);
@@ -32,7 +32,7 @@ Table III reports (models with the option `sedan`, narrow region, IoU 0.3):
 | stem | 63.47 | 69.05 |
 | expand | 63.12 | 67.92 |
 
-The released code trains on one GPU with batch size 10 and epochs of 17,458 frames. The row of
+The authors' code trains on one GPU with batch size 10 and epochs of 17,458 frames. The row of
 `no_cbam` has the same marks as `model` in the paper. It is read as the model without
 attention, because the paper says that attention helps once neck and heads are complex enough, and
 no other row would show that.
@@ -92,7 +92,7 @@ PRESETS = {
         "evaluation.empty_frames": "class",
     },
 }
-"""Fields in which the paper and the released code differ."""
+"""Fields in which the paper and the authors' code differ."""
 
 SIGMAS = {
     "sigma3": {"heatmap_sigma_mode": "fixed", "heatmap_sigma_bins": 3.0},

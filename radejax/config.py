@@ -61,7 +61,7 @@ class Config(Options):
     The defaults are the paper's training of RADE-Net on K-Radar. Three fields differ from the
     paper: `model.cbam` ("official", the released block), `loss.assignment` ("center") and
     `decode.raw_yaw` ("nms"). `docs/deviations.md` describes them.
-    `configs/radenet.py` has presets for the paper and the released code.
+    `configs/radenet.py` has presets for the paper and the authors' code.
     """
 
     seed: Seed = 0

@@ -6,6 +6,8 @@ import re
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 
 REPLACED = {
+    r"\breleased code\b": "authors' code",
+    r"\breference implementation": "authors' code",
     r"\bhouse\b": "architecture",
     r"\brooms?\b": "package",
     r"\bdoors?\b": "entry point",

@@ -106,7 +106,7 @@ class DataOptions(Options, section="config.data"):
     max_objects: AtLeastOne = 32
     """Number of objects to which each frame is padded; K-Radar v2.1 has at most 14."""
     azimuth_mapping: AzimuthMapping = "true"
-    """Mapping of azimuth bins to angles: true, or stretched for official checkpoints."""
+    """Mapping of azimuth bins to angles: true, or stretched for the authors' checkpoints."""
     num_threads: Count | None = None
     """Number of threads that read frames; None: one per CPU that the process may use;
     0: the main thread reads them."""

@@ -44,7 +44,7 @@ class DecodeOptions(Options, section="config.decode"):
     score_threshold: ScoreThreshold = 0.3
     """Score threshold of all classes, or one per class in their order."""
     threshold_inclusive: bool = True
-    """Keep scores equal to the threshold, as in the paper; the released code does not."""
+    """Keep scores equal to the threshold, as in the paper; the authors' code does not."""
     nms_iou: Fraction = 0.3
     """NMS removes a box whose IoU with a better box is at least this."""
     per_class_nms: bool = False
@@ -59,7 +59,7 @@ class DecodeOptions(Options, section="config.decode"):
     """Temperature and offset per class, by which scores become probabilities (see
     `scores.fit_calibration`); None: no probabilities. `radejax calibrate` fits them."""
     clip_sizes: bool = True
-    """Clip sizes to at least 0.01 m; in the released code, they may be negative."""
+    """Clip sizes to at least 0.01 m; in the authors' code, they may be negative."""
 
     @pydantic.model_validator(mode="after")
     def _check(self) -> DecodeOptions:
@@ -117,7 +117,7 @@ def decode(
 ) -> Detections:
     """Decodes a batch of detection maps to boxes.
 
-    As in the released code, a peak is a bin whose score passes the threshold and is not
+    As in the authors' code, a peak is a bin whose score passes the threshold and is not
     exceeded in its 3 x 3 neighborhood in the map of the same class. A bin gives at most one
     box, of the class with the highest score (the first of equals). Boxes whose center is
     outside the region are removed, and greedy bird's-eye-view NMS follows.

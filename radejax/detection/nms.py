@@ -31,7 +31,7 @@ def rotated_nms(
 
     Args:
         boxes: `[..., K, 7]` or `[..., K, 8]` boxes by descending score. The length of the
-            latter's yaw vector scales the box, as in the released code (see `bev_iou`).
+            latter's yaw vector scales the box, as in the authors' code (see `bev_iou`).
         is_valid: `[..., K]` bool, False for rows that are not kept and suppress no others.
         iou_threshold: IoU at or above which the later box is suppressed.
         classes: `[..., K]` class indices. If given, only boxes of the same class suppress

@@ -275,7 +275,7 @@ class RadarGrid(ArrayValues):
                 "stretched" reproduces the released RADE-Net: the padded azimuth bins
                 span the unpadded field of view, and the last range bin lies at the
                 nominal maximum range. This displaces targets by up to 5 columns from the
-                data; use it only for official checkpoints, which were trained with it.
+                data; use it only for checkpoints of the authors' code, which were trained with it.
 
         Raises:
             UserError: The mapping is unknown, or "stretched" for axes that are not uniform.
@@ -402,7 +402,7 @@ class RadarGrid(ArrayValues):
         range_m = xp.sqrt(x_m * x_m + y_m * y_m)
         azimuth = -xp.arctan2(y_m, x_m)
         # The order of operations decides in which direction exact half bins are rounded.
-        # This order gives the bins of the released code. Azimuth is measured from the
+        # This order gives the bins of the authors' code. Azimuth is measured from the
         # middle of the axis, so that a point straight ahead lies exactly in the middle
         # even in float32.
         axis = self.range_m

@@ -227,7 +227,7 @@ class Detector:
 
         Args:
             path: Workdir of `train.py`, its `checkpoints` or one of them, a folder of
-                `radejax export`, or an official checkpoint file.
+                `radejax export`, or a checkpoint file of the authors' code.
             step: Step of the checkpoint, or "best"; the latest if None.
             image_backbone: Weights of a frozen image backbone. They are needed if the
                 file that the run was trained with has moved, or if the exported folder

@@ -76,7 +76,7 @@ class SavedModel:
     """A trained model with its config and radar grid.
 
     Attributes:
-        config: Config that the model was trained with; for official weights, the
+        config: Config that the model was trained with; for weights of the authors' code, the
             corresponding config.
         grid: Axes of the sensor.
         variables: Parameters and other collections of the model as NumPy arrays.

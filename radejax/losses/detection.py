@@ -40,11 +40,11 @@ class LossOptions(Options, section="config.loss"):
     heatmap_sigma_bins: Positive = 3.0
     """Standard deviation in the mode fixed, in bins."""
     gwd_transform: Transform = "sqrt"
-    """Transform of the Wasserstein distance: sqrt (paper), none (released code), log1p."""
+    """Transform of the Wasserstein distance: sqrt (paper), none (authors' code), log1p."""
     gwd_tau: Positive = 1.65
     """Loss of a distance d: 1 - 1 / (tau + transform(d))."""
     normalize_yaw: bool = False
-    """Normalize the predicted yaw vector before the Wasserstein distance. The released code
+    """Normalize the predicted yaw vector before the Wasserstein distance. The authors' code
     does not. Smooth L1 always uses the raw vector, so that the network learns to predict
     unit length."""
     assignment: Assignment = "center"

@@ -55,7 +55,7 @@ def gaussian_heatmap(
         sigma_mode: Standard deviations sr and sa along range and azimuth. "fixed" uses
             `sigma_bins` for both, "adaptive" 0.3 max(l, w) for both, and "anisotropic"
             l / 6 for sr and w / 6 for sa. The latter two use values in meters as bins, as
-            in the released code.
+            in the authors' code.
         sigma_bins: Standard deviation in bins, for "fixed".
 
     Returns:
@@ -104,7 +104,7 @@ def focal_loss(logits: Maps, target: Maps) -> Float[jax.Array, ""]:
 
     For the predicted probability p, the loss of a bin is -(1 - p)^2 log p where the target
     t is 1, and -(1 - t)^4 p^2 log(1 - p) elsewhere. The sum is divided by the number of bins
-    with target 1, or by the number of all bins if there are none. As in the released code,
+    with target 1, or by the number of all bins if there are none. As in the authors' code,
     p is clipped to [1e-6, 1 - 1e-6], with no gradient outside.
 
     Args:

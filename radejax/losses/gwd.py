@@ -20,7 +20,7 @@ Three measures make it usable as a loss in float32:
   which avoids the difference of large numbers.
 * sqrt(d) is smoothed below 1e-6 m, so its gradient is finite at zero distance.
 
-In the released code, the width is along the heading and the length across it; here, the
+In the authors' code, the width is along the heading and the length across it; here, the
 length is along the heading. This corresponds to a rotation of both Gaussians by 90 deg
 about their means, which changes no term of d for any length of the yaw vectors, so distance
 and gradients are the same.
@@ -54,7 +54,7 @@ _SMOOTHING_M = 1e-6  # scale below which sqrt(d) is smoothed
 def gwd(a: Boxes8, b: Boxes8) -> PerPair:
     """Computes the squared 2-Wasserstein distance between corresponding boxes' Gaussians.
 
-    As in the released code, the yaw vectors are not normalized, and eigenvalues are clamped
+    As in the authors' code, the yaw vectors are not normalized, and eigenvalues are clamped
     at 1e-12.
 
     Args:
@@ -92,7 +92,7 @@ def gwd_loss(
         a: `[..., 8]` boxes, see `gwd`.
         b: `[..., 8]` boxes, see `gwd`.
         tau: Offset tau; the loss of equal boxes is 1 - 1 / tau (0.394 for 1.65).
-        transform: Function f. "none" is d (as in the released code), "sqrt" is sqrt(d)
+        transform: Function f. "none" is d (as in the authors' code), "sqrt" is sqrt(d)
             (as in the paper) and "log1p" is log(1 + d).
 
     Returns:

@@ -49,7 +49,7 @@ class SpatialAttention(layers.Layer):
 
     Attributes:
         mean_first: Whether to concatenate [mean, max], as in the paper, instead of
-            [max, mean], as in the released code.
+            [max, mean], as in the authors' code.
     """
 
     mean_first: bool = False
@@ -76,7 +76,7 @@ class CBAM(SkipAttention):
     """Channel attention followed by spatial attention.
 
     Attributes:
-        is_official: Whether it is the block of the released code, which has a `ConvGNSiLU`
+        is_official: Whether it is the block of the authors' code, which has a `ConvGNSiLU`
             before the attentions, adds the output of this convolution to theirs, and ends
             with another `ConvGNSiLU`. The paper's applies both attentions only.
     """

@@ -1,7 +1,7 @@
 """Fusion of the radar map with camera features at the projections of the radar queries.
 
 References:
-    DinoRADE, sections 3.3 to 3.5. Where the released code differs from the paper, the
+    DinoRADE, sections 3.3 to 3.5. Where the authors' code differs from the paper, the
     options `weighting`, `gate` and `out_of_view` select either.
 """
 

@@ -4,7 +4,7 @@ Separate heads predict a class heatmap and eight box parameters per bin.
 
 References:
     RADE-Net, sections III-D and III-E, and equation (12). The paper's "Sigmoid after each
-    convolution" is an error: the released code has GroupNorm and SiLU between convolutions
+    convolution" is an error: the authors' code has GroupNorm and SiLU between convolutions
     and one sigmoid at the end of the heatmap head. Here, losses and decoding apply that
     sigmoid.
 """
@@ -136,7 +136,7 @@ class Heads(layers.Part):
         kind: Name of the heads' type in `HEADS`, or "module:Class".
         dtype: Dtype of the computation up to the last convolution.
         heatmap_prior: Approximate score of every bin in an untrained model, 0.5 in the
-            released code. A lower value (0.1 in CenterNet) suits mostly empty scenes.
+            authors' code. A lower value (0.1 in CenterNet) suits mostly empty scenes.
         outputs: Names and channels of further heads.
     """
 

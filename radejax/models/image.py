@@ -5,7 +5,7 @@ ResNet (stem and first three stages) is frozen and its last stage is trained, so
 separate modules. `radejax.weights.image_backbone` reads both from torchvision's file.
 
 References:
-    DinoRADE, section 3.2. The layers of the neck are those of the released code.
+    DinoRADE, section 3.2. The layers of the neck are those of the authors' code.
     He et al., Deep residual learning, arXiv:1512.03385. Strides are those of torchvision.
 """
 

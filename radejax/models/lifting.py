@@ -29,7 +29,7 @@ from radejax.models.options import (
 )
 
 OFFICIAL_OFFSET_M = (-2.08, -0.13, 0.9)
-"""The `radar_from_lidar_m` of the released code, to be used with the "pinhole" image."""
+"""The `radar_from_lidar_m` of the authors' code, to be used with the "pinhole" image."""
 
 _OFFICIAL_DEPTH_OFFSET_M = 1e-6
 
@@ -72,7 +72,7 @@ def reference_points(
         num_azimuth: Azimuth bins A of the map, including padding.
         num_elevation: Number E of elevation segments.
         out_of_view: "official" treats the left and right `MARGIN_PX` columns of the image
-            as out of view and adds 1e-6 m to the depth, as in the released code.
+            as out of view and adds 1e-6 m to the depth, as in the authors' code.
 
     Returns:
         Reference points, whose leading axis is 1 for one camera and B for a batch.
@@ -122,7 +122,7 @@ class WeightingNetwork(Layer):
         num_elevation: Number E of elevation segments.
         kind: "mlp" has two layers per bin, as in the paper, which does not state their
             widths. "cnn" has three 3x3 convolutions and a 1x1 convolution, as in the
-            released code. "off" returns the weight 1 for every segment instead of a
+            authors' code. "off" returns the weight 1 for every segment instead of a
             softmax, for the ablation in which all queries of a bin are equal.
         dtype: Dtype of the computation; the weights are float32.
     """

@@ -75,7 +75,7 @@ class RadeNetOptions(Options, section="config.model"):
     """Activations that the backward pass recomputes to save memory: none, blocks (all but
     those between blocks) or full (all but those between backbone, neck and heads)."""
     heatmap_prior: Annotated[float, Gt(0), Lt(1)] = 0.5
-    """Score that an untrained model predicts, between 0 and 1; 0.5 in the released code. A
+    """Score that an untrained model predicts, between 0 and 1; 0.5 in the authors' code. A
     lower value (0.1 in CenterNet) suits mostly empty scenes."""
     input_center: float = 0.0
     """Subtracted from the projection; 0 in the paper. Noise is about 0.63."""
@@ -270,7 +270,7 @@ class QueryGridOptions(Options, section="config.model.query_grid"):
 
     @classmethod
     def official(cls) -> Self:
-        """Returns the released code's axes, 256 range and 112 azimuth bins in the FOV."""
+        """Returns the authors' code's axes, 256 range and 112 azimuth bins in the FOV."""
         return cls(
             range_m=(118 / 256 / 2, 118 / 256),
             azimuth_deg=(-53 + 106 / 112 / 2, 106 / 112),

@@ -1,7 +1,7 @@
 """RADE-Net, which predicts a heatmap and box parameters from radar projections.
 
 References:
-    Leitgeb et al., RADE-Net. The architecture is that of the released code.
+    Leitgeb et al., RADE-Net. The architecture is that of the authors' code.
 """
 
 from __future__ import annotations

@@ -91,8 +91,8 @@ def run(
     Args:
         config: Complete configuration of one seed; `run_seeds` runs several.
         workdir: Folder of the run, created if missing.
-        init_from: Weights to start from: an official checkpoint file, another workdir, or
-            another model that `load_model` accepts.
+        init_from: Weights to start from: a checkpoint file of the authors' code, another
+            workdir, or another model that `load_model` accepts.
         init_partial: Model whose weights are used where name and shape are equal, see
             `matching_weights`, instead of `init_from`.
         profile: Folder for a profiler trace of the steps `config.logging.profile_steps`;

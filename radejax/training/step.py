@@ -90,7 +90,7 @@ def _cosine(train: TrainOptions, num_steps: int, _: int) -> optax.Schedule:
 
 
 def _cyclic_cosine(train: TrainOptions, _: int, steps_per_epoch: int) -> optax.Schedule:
-    """Creates a schedule: linear from zero, then that of the released code.
+    """Creates a schedule: linear from zero, then that of the authors' code.
 
     The rate decreases in one epoch, increases in the next, and so on: this is torch's
     `CosineAnnealingLR` with `T_max = steps_per_epoch`, stepped per batch. Its closed form

@@ -147,7 +147,7 @@ def torch_name(rules: Rules, path: str) -> str:
         name = re.sub(pattern, replacement, name)
     if "/" in name:
         raise UserError(
-            f"{ours.rpartition('/')[0]} has no counterpart in the released code"
+            f"{ours.rpartition('/')[0]} has no counterpart in the authors' code"
         )
     module, dot, leaf = name.rpartition(".")
     return module + dot + _LEAVES.get(leaf, leaf)

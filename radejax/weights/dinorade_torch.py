@@ -1,6 +1,6 @@
 """Conversion of official DinoRADE checkpoints (PyTorch) to Flax, without torch.
 
-The released code names its tensors `rad_backbone.*`, `rad_neck.*`, `head.*` (as in
+The authors' code names its tensors `rad_backbone.*`, `rad_neck.*`, `head.*` (as in
 RADE-Net), `image_neck.*`, `fusion.*` and `image_backbone.*`.
 """
 
@@ -23,7 +23,7 @@ from radejax.weights.image_backbone import RESNET_RULES
 PART = "rad_backbone."
 """Start of names by which a DinoRADE state dict is recognized."""
 
-# Modules that the released code always creates, even if its forward pass does not use them.
+# Modules that the authors' code always creates, even if its forward pass does not use them.
 _UNUSED = r"rad_backbone\.cbam_|fusion\.output_proj\."
 
 
@@ -37,7 +37,7 @@ def read(
 
     The geometry is the released one. The camera is `CameraCalibration.from_kradar(file,
     radar_from_lidar_m=OFFICIAL_OFFSET_M).camera("pinhole")`, see `radejax.models.lifting`.
-    The maps include the padding; their grid for official weights is
+    The maps include the padding; their grid for weights of the authors' code is
     `RadarGrid.kradar().padded(8, "stretched")`.
 
     Args:
@@ -68,7 +68,7 @@ def read(
     is_resnet = any(n.startswith("image_backbone.frozen_layers.") for n in tensors)
     is_resnet = is_resnet and dinov3 is None
     if is_resnet:
-        # The released code only scales the images of its ResNet to [0, 1].
+        # The authors' code only scales the images of its ResNet to [0, 1].
         fields["image"] = {"kind": "resnet50", "standardize": False}
     else:
         fields["image"], backbone = _transformer(tensors, source, dinov3)

@@ -26,7 +26,7 @@ def read(
 ) -> tuple[RadeNetOptions, MutableVariableDict]:
     """Returns the options and the variables of tensors by official name.
 
-    The maps include the padding; their grid for official weights is
+    The maps include the padding; their grid for weights of the authors' code is
     `RadarGrid.kradar().padded(8, "stretched")`.
 
     Args:

@@ -52,7 +52,7 @@ def make_maps(heatmap, params):
     )
 
 
-# The released code ----------------------------------------------------------------
+# The authors' code ----------------------------------------------------------------
 
 
 def reference_maps(stream, blobs, width):

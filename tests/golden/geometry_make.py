@@ -5,10 +5,10 @@
 The reference numbers come from the released RADE-Net code (commit 9a94d64) with
 PyTorch 2.13.0 (CPU), NumPy 2.4.6 and OpenCV 5.0.0; inputs are synthetic.
 
-geometry_encoding.npz: ego positions of 108 objects and the bins that the released code
+geometry_encoding.npz: ego positions of 108 objects and the bins that the authors' code
     assigns to them on three grids. Ours must agree exactly.
 geometry_iou.npz: 580 pairs of boxes and their overlap by float64 polygon clipping
-    (`iou_*_exact`), and by the released code where it is reliable. Ours agrees with the
+    (`iou_*_exact`), and by the authors' code where it is reliable. Ours agrees with the
     former to 1e-12 in float64 and 5e-7 in float32, with the latter to 5e-4.
 """
 

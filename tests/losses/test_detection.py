@@ -26,7 +26,7 @@ PARTS = ("focal", "gwd", "smooth_l1")
 GRID = RadarGrid.reduced(num_doppler=4, num_range=24, num_elevation=4, num_azimuth=16)
 
 
-# The released code ----------------------------------------------------------------
+# The authors' code ----------------------------------------------------------------
 
 
 def reference_maps(stream, batch):

@@ -2,7 +2,7 @@
 
 `../shared/fixtures/trajectory` holds twelve optimizer steps of the released RADE-Net on
 six recipe frames, and four of DinoRADE; its README, section 14. Limits are a few times
-what another order of float32 sums alone does to the released code there.
+what another order of float32 sums alone does to the authors' code there.
 """
 
 import json

@@ -1,4 +1,4 @@
-"""Tests of radejax.weights.dinorade_torch, against the released code's outputs."""
+"""Tests of radejax.weights.dinorade_torch, against the authors' code's outputs."""
 
 import json
 
@@ -33,7 +33,7 @@ def seeded(released, make):
 
 
 def load(content, **options):
-    """Model and variables of an official checkpoint."""
+    """Model and variables of a checkpoint of the authors' code."""
     saved = load_torch(content, **options)
     return saved.model, saved.variables
 

@@ -31,7 +31,7 @@ def small_state(radenet_golden):
 
 
 def load(content, **options):
-    """Model and variables of an official checkpoint."""
+    """Model and variables of a checkpoint of the authors' code."""
     saved = load_torch(content, **options)
     return saved.model, saved.variables
 

@@ -70,7 +70,7 @@ class Frame(LabelledFrame):
         header: Frame numbers of all sensors and the time stamp.
         labels: All objects of the label file, unfiltered and in the LiDAR frame.
         tesseract_path: File of the 4D radar tensor, or None if it is missing.
-        projection_path: File of the `.npy` projection of the reference implementation,
+        projection_path: File of the `.npy` projection of the authors' code,
             or of a reduced release, or None if it is missing. It is the `radar_path` if
             the tensor is missing.
         ego_speed_mps: Speed of the radar over ground, or None as in all label files.
@@ -113,7 +113,7 @@ class ReadOptions:
         version: Version of the labels: v1.0, v1.1, v2.0 or v2.1.
         visibility: Visibility flags of the objects to keep, or None for all.
         include_unstarred_v11_labels: Whether lines of v1.x labels without a `*` are
-            objects too, as in the reference implementation.
+            objects too, as in the authors' code.
         classes: Classes to keep.
         field_of_view: Whether to keep only boxes whose center is in the field of view.
         sequence_numbers: Sequences to read, or None for all. None skips and counts
@@ -121,7 +121,7 @@ class ReadOptions:
         weather: Weathers of the sequences to keep, or None for all.
         camera_calibration: Folder of camera calibrations (`calib_seq_v2/`, `common/`).
         common_camera: Whether to use `common/cam_front0.yml` for all sequences, as the
-            reference implementation does.
+            authors' code does.
 
     Raises:
         UserError: A value is invalid.

@@ -201,7 +201,7 @@ def read_label_file(
         path: Label file.
         version: Label version, such as "v2.1".
         include_unstarred: Whether lines of v1.x without a `*` are objects too if they
-            have the fields of an object, as in the reference implementation.
+            have the fields of an object, as in the authors' code.
 
     Raises:
         DataError: The header is malformed, or the file is not text.

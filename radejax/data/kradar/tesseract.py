@@ -115,7 +115,7 @@ def _check_power(
 def read_projection_npy(
     path: PathLike, *, projection_shape: tuple[int, ...] | None = None
 ) -> Float[np.ndarray, "R A DE"]:
-    """Reads a projection in the order of the released code, or with its channels last.
+    """Reads a projection in the order of the authors' code, or with its channels last.
 
     Args:
         path: `DERA_tesseract_*.npy`, `[D+E, R, A]` floats. `[R, A, D+E]` is read too if
@@ -166,7 +166,7 @@ def _projection_axes(
 def read_frame(path: PathLike, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
     """Returns the float32 projection of a radar tensor, or of a file of another release.
 
-    Files of `.npy` contain projections of the reference implementation or, by their names,
+    Files of `.npy` contain projections of the authors' code or, by their names,
     frames of K-Radar's reduced releases (see `radejax.data.kradar.reduced`).
 
     Raises:
