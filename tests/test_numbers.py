@@ -25,8 +25,6 @@ QUOTED = ("claim", "paper")
 
 OTHERS = {
     "0.015": "docs/reports/2026-11-24_camera_by_condition.md, the gate",
-    "0.14": "percent, docs/reports/2026-11-23_training_parity.md",
-    "0.4": "percent, docs/reports/2026-11-23_training_parity.md",
     "0.46": "range bin of K-Radar in meters",
     "1.4": "three of them",
     "3.6": "three range bins of the quickstart",
