@@ -353,6 +353,7 @@ def _draw_scores(
 ) -> dict[str, Figure]:
     """Draws the rates over score thresholds, and reliability diagrams, of every class."""
     from radejax.visualize.curves import Curve, draw_precision_recall
+    from radejax.visualize.style import halo
 
     iou = options.iou_thresholds[0]
     over = np.linspace(0, 1, 201)
@@ -381,8 +382,10 @@ def _draw_scores(
     title = f"Reliability{suffix}, with the number of predictions per bin"
     reliability = draw_precision_recall(diagrams, title, labels)
     for ax, of_class in zip(reliability.axes, bins.values(), strict=False):
-        for count, x, y in np.hstack(of_class).T:
-            ax.text(x, y + 0.01, f"{count:.0f}", fontsize=6, ha="center", clip_on=True)
+        for line, found in zip(ax.lines[1:], of_class, strict=True):
+            for count, x, y in zip(*found, strict=True):
+                text = ax.text(x, y + 0.03, f"{count:.0f}", size=6, ha="center")
+                text.set(color=line.get_color(), path_effects=halo(2, "white"))
     labels = "score threshold", "rate"
     thresholds = draw_precision_recall(rates, f"Score thresholds{suffix}", labels)
     return {"thresholds": thresholds, "reliability": reliability}
