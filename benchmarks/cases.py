@@ -37,16 +37,16 @@ from radejax.inference.exported_loader import load as load_exported
 GRID = RadarGrid.kradar()
 
 
-def tpm(machine):
+def projection(machine):
     """Tensor max projection of a tesseract in the memory order of `loadmat`, and from files."""
     tesseract = inputs.make_tesseract(GRID.shape_drea)
     columns = {
         "radejax": lambda: timed(lambda: project_tensor(tesseract)),
-        "released formula": lambda: timed(lambda: inputs.project_released(tesseract)),
+        "authors' formula": lambda: timed(lambda: inputs.project_released(tesseract)),
         "plain read (sum)": lambda: timed(tesseract.sum),
     }
     yield Case(
-        name="TPM on the host",
+        name="projection on the host",
         columns=columns,
         error=difference(
             [project_tensor(tesseract)], [inputs.project_released(tesseract)]
@@ -57,7 +57,7 @@ def tpm(machine):
         x = jax.device_put(np.ascontiguousarray(tesseract)[None])
         program, cost = compiled(project_jax, x)
         columns = {"radejax": waiting(program, x)}
-        yield Case(name="TPM on the device", columns=columns, **cost)
+        yield Case(name="projection on the device", columns=columns, **cost)
     with tempfile.TemporaryDirectory() as folder:
         for name, is_small in (("uncompressed", False), ("compressed", True)):
             path = pathlib.Path(folder) / f"{name}.mat"
@@ -66,13 +66,15 @@ def tpm(machine):
                 "radejax": functools.partial(timed, lambda p=path: project_file(p))
             }
             if not is_small:
-                columns["loadmat, released formula"] = lambda p=path: timed(
+                columns["loadmat, authors' formula"] = lambda p=path: timed(
                     lambda: inputs.project_released(scipy.io.loadmat(p)["arrDREA"])
                 )
             note = (
-                f"{tesseract.nbytes / 1e6:.0f} MB of cells, the file in the page cache"
+                f"{tesseract.nbytes / 1e6:.0f} MB of bins, the file in the page cache"
             )
-            yield Case(name=f"TPM from a .mat, {name}", columns=columns, note=note)
+            yield Case(
+                name=f"projection from a .mat, {name}", columns=columns, note=note
+            )
 
 
 def adc(machine):
@@ -102,7 +104,7 @@ def adc(machine):
 
 
 def nms(machine):
-    """Decoding of peaks to boxes with NMS, compared with the released Python loops."""
+    """Decoding of peaks to boxes with NMS, compared with the authors' Python loops."""
     for peaks in (40, 100):
         maps, loops = inputs.make_maps(peaks), inputs.peaks_on_host(peaks)
         ours, cost = compiled(inputs.decoder(128), maps)
@@ -113,7 +115,7 @@ def nms(machine):
             name=f"decoding and NMS, {peaks} peaks",
             columns={
                 "radejax": waiting(ours, maps),
-                "released loops": lambda loops=loops: timed(
+                "authors' loops": lambda loops=loops: timed(
                     lambda: inputs.loop_decode(*loops)
                 ),
             },
@@ -155,7 +157,7 @@ def load(machine):
             )
         folder = pathlib.Path(stack.enter_context(tempfile.TemporaryDirectory()))
         paths = inputs.write_npy(folder, size, GRID)
-        columns["released .npy"] = functools.partial(
+        columns["authors' .npy"] = functools.partial(
             timed, lambda: inputs.read_npy(paths, size, count)
         )
         yield Case(name="records to batches", columns=columns, frames=count)
@@ -245,7 +247,7 @@ BENCHMARKS = {
     "radenet": networks.radenet,
     "radenet_training": networks.radenet_training,
     "dinorade": networks.dinorade,
-    "tpm": tpm,
+    "projection": projection,
     "adc": adc,
     "simulator": simulate,
     "dinorade_training": functools.partial(networks.dinorade, task="training step"),

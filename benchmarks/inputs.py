@@ -52,7 +52,7 @@ def make_tesseract(shape):
 
 
 def project_released(tesseract):
-    """Computes the projection `[R, A, D+E]` as released: logarithms, transpose, two maxima."""
+    """Computes the projection `[R, A, D+E]` of the authors' code: logarithms, two maxima."""
     level = (10 * np.log10(tesseract + 1e-10) + 1.2) / 184.3
     level = np.transpose(level, (1, 3, 2, 0))  # [R, A, E, D]
     return np.concatenate([level.max(axis=2), level.max(axis=3)], axis=-1)
@@ -173,7 +173,7 @@ def read_npy(paths, size, count):
         np.stack([np.load(path) for path in itertools.islice(names, size)])
 
 
-# Maps, and the released post-processing step by step ---------------------------------
+# Maps, and the authors' post-processing step by step ---------------------------------
 
 MAP_GRID = RadarGrid.kradar().padded(8)
 MAP_SHAPE = (MAP_GRID.num_range, MAP_GRID.num_azimuth, 5)

@@ -370,7 +370,7 @@ def attention(machine):
 
 def detector(machine):
     """Tesseracts in host memory to boxes, compared with the steps of the authors' code."""
-    name = "tesseract to boxes"
+    name = "radar tensor to boxes"
     for dtype, size in settings(machine, name, DETECTOR):
         config, model, _ = network("radenet.py", dtype)
         found = stages.untrained(config, dtype=config.model.dtype)
@@ -388,7 +388,7 @@ def detector(machine):
             (theirs,) = rivals(
                 machine, "radenet", config.model.to_dict(), state, x, *how
             ).values()
-            columns["released chain"] = functools.partial(
+            columns["authors' chain"] = functools.partial(
                 released_chain, frames, theirs, inputs.peaks_on_host(40)
             )
         yield Case(
@@ -396,7 +396,7 @@ def detector(machine):
             columns=columns,
             frames=size,
             dtype=dtype,
-            note="released chain: formula of all cells, torch, loops over 40 peaks",
+            note="authors' chain: formula of all bins, torch, loops over 40 peaks",
             **cost,
         )
 

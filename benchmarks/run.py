@@ -1,7 +1,7 @@
 """Runs all benchmarks that fit this machine, in alternation with PyTorch and the authors' code.
 
     python benchmarks/run.py                       # everything
-    python benchmarks/run.py --only radenet tpm    # some
+    python benchmarks/run.py --only radenet projection    # some
     python benchmarks/run.py --minutes 15          # what did not fit is listed; again: the rest
     python benchmarks/run.py --tables              # only write the tables again
 

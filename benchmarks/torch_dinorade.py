@@ -3,7 +3,7 @@
 The network is that of `configs/dinorade.py` without options, with the layers and sizes of the paper
 and the authors' code, and every query counts as in view. Deformable attention has the pure PyTorch
 form (`grid_sample`), which the authors' code uses if its CUDA operator is not built. Self-attention
-is PyTorch's fused operator. Tensors of the radar branch have the names of the released RADE-Net,
+is PyTorch's fused operator. Tensors of the radar branch have the names of the authors' RADE-Net,
 and the others those of radejax's parameters (`networks.torch_state`).
 """
 

@@ -1,6 +1,6 @@
 """RADE-Net in PyTorch, only for comparing speed and as reference values of tests.
 
-The network follows the description of the released one. Tensors have its names, so that
+The network follows the description of the authors' one. Tensors have its names, so that
 `radejax.weights.radenet_torch` can convert state dicts in both directions.
 """
 
@@ -101,7 +101,7 @@ class SpatialAttention(nn.Module):
 
 
 class CBAM(nn.Module):
-    """Channel and spatial attention, as released ("official") or as in the paper ("paper")."""
+    """Channel and spatial attention of the authors' code ("official") or the paper ("paper")."""
 
     def __init__(self, width, groups, kind):
         super().__init__()

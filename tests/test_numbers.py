@@ -120,7 +120,7 @@ def stored() -> set[str]:
                 found.add("{difference:.1f} ({low:.1f} to {high:.1f})".format(**part))
             if "cell" in next(iter(part.get("rows", ())), ()):
                 found |= {*_ablation_rows(part["rows"])}
-            if part.get("name") == "TPM on the host":
+            if part.get("name") == "projection on the host":
                 found |= {f"{1000 * x:.0f} ms" for x in part["wall_s"].values()}
     return found
 
