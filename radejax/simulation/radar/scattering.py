@@ -252,10 +252,11 @@ def received_power(
 ) -> Values:
     """Computes linear power by the radar equation, gain x cross-section x pattern / R^4.
 
-    The gain includes the receiver's high-pass filter.
+    The gain includes the receiver's high-pass filter. Nearer than 1 m, R is 1 m.
     """
-    distance = np.maximum(np.linalg.norm(position_m, axis=1), 1.0)
-    forward = np.clip(position_m[:, 0] / distance, 0.0, 1.0)
+    true = np.linalg.norm(position_m, axis=1)
+    forward = np.clip(position_m[:, 0] / np.maximum(true, 1e-3), 0.0, 1.0)
+    distance = np.maximum(true, 1.0)
     pattern = forward**parameters.pattern_exponent
     gain = 10.0 ** ((parameters.gain_db + parameters.receiver_db) / 10.0)
     passed = sensor.high_pass(distance, parameters.high_pass_m)

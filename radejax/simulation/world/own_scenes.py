@@ -48,7 +48,8 @@ class SceneObject(Options, section="column"):
     y: float
     """To the left."""
     z: float
-    """Upward."""
+    """Upward, from the height of the LiDAR, as in predictions. The radar is 0.7 m below it, or as
+    `simulation.radar_from_lidar_m` says."""
     l: Positive  # noqa: E741, the name in files of predictions
     """Length in meters."""
     w: Positive
@@ -143,7 +144,7 @@ def read_frames(path: files.PathLike, radar_from_lidar_m: Shift) -> list[Frame]:
         rows = list(group)
         one = rows[0]
         boxes = np.array([(x.x, x.y, x.z, x.l, x.w, x.h, x.yaw) for x in rows])
-        boxes[:, :3] -= radar_from_lidar_m
+        boxes[:, :2] -= radar_from_lidar_m[:2]  # z of boxes is the LiDAR's
         labels: list[Label] = []
         for row, box in zip(rows, boxes.tolist(), strict=True):
             is_moving = bool(row.model_fields_set & {"vx_mps", "vy_mps"})

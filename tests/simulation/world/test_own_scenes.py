@@ -48,11 +48,12 @@ def test_a_scene_has_the_boxes_velocities_and_conditions_of_the_file(tmp_path):
     assert [spec.name for spec in specs] == ["00000_00000", "00001_00001"]
     assert [spec.timestamp_s for spec in specs] == [0.0, 0.1]
     sequence = source.make(2)
-    assert sequence.ground_m == pytest.approx(-2.0)  # lower sides of the boxes
+    assert sequence.ground_m == pytest.approx(-1.3)  # lower sides of the boxes
     assert sequence.ego_speed_mps.tolist() == [4.0, 5.0]
     first = sequence.frame(0)
     order = np.argsort(first.boxes[:, 0])
-    expected = [[9, -3, -1.2, 4.5, 1.9, 1.6, 0.0], [31, 1, -1.2, 4.5, 1.9, 1.6, 0.1]]
+    # z of the file is the LiDAR's, which is 0.7 m above the radar.
+    expected = [[9, -3, -0.5, 4.5, 1.9, 1.6, 0.0], [31, 1, -0.5, 4.5, 1.9, 1.6, 0.1]]
     np.testing.assert_allclose(first.boxes[order], expected, atol=1e-9)
     # Given; and by the positions of the track, 1 m nearer after 0.1 s.
     velocity = first.relative_velocity_mps[order]
