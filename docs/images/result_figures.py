@@ -59,6 +59,7 @@ _CAMERA = ("camera", "R+C+W long", "R long")
 _SHORT = ("4", "R+C+W", "R")
 CLAIMS = (
     Claim("full network better than the plain one", "3", "model", "base", paper=4.73),
+    Claim("attention alone does not help", "3", "base", "cbam", paper=1.1),
     Claim("larger heads help", "3", "cbam_heads", "cbam", paper=1.8),
     Claim("dilated neck helps", "3", "model", "cbam_heads", paper=4.0),
     Claim("attention helps with neck and heads", "3", "model", "no_cbam", paper=2.39),
@@ -74,10 +75,10 @@ CLAIMS = (
     Claim("camera helps, short schedule", *_SHORT, "Pedestrian"),
     Claim("camera helps, short schedule", *_SHORT, "Motorcycle"),
     Claim("camera helps, short schedule", *_SHORT, "Bicycle"),
-    Claim("covered lens does no harm", *_SHORT, condition="lens heavily or fully covered"),
-    Claim("elevation weights help", "4", "R+C+W", "R+C", paper=0.4),
+    Claim("camera with a covered lens, short", *_SHORT, condition="lens heavily or fully covered"),
+    Claim("elevation weights help, short schedule", "4", "R+C+W", "R+C", paper=0.4),
     Claim(
-        "foundation model better than a ResNet", "4", "R+C+W", "R+C+W ResNet", paper=3.0,
+        "foundation model, short schedule", "4", "R+C+W", "R+C+W ResNet", paper=3.0,
         is_tested=False,
     ),
 )  # fmt: skip
@@ -130,7 +131,7 @@ def draw_claims(path: pathlib.Path) -> None:
     """Draw a forest plot: one row per claim with its interval, and the paper's size."""
     cfar = Claim("RADE-Net beats CFAR, radar realistic", "", "", "")
     found = [(cfar, *_against_cfar())] + [(c, *_stored(c)) for c in CLAIMS]
-    figure = new_figure(8.0, 7.6, dpi=140)
+    figure = new_figure(8.0, 8.0, dpi=140)
     axes = figure.add_axes((0.40, 0.15, 0.41, 0.80))
     axes.set_xscale("symlog", linthresh=LINEAR_POINTS, linscale=0.8)
     axes.set_title("AP difference on simulated data (BEV, IoU 0.3)", fontsize=11)
