@@ -42,6 +42,7 @@ OTHERS = {
     "11.1": "MB of 256 x 107 x 101 float32",
     "22.1": "the same in float64",
     "95.7": "percent by which 11.1 is smaller than 259.5",
+    "6.4": "narrow region in meters",
     "91.5": "percent by which 22.1 is smaller than 259.5",
     "3.7": "80.5 - 76.8 of recorded.json",
     "259.5": "MB of 64 x 256 x 37 x 107 float32",
