@@ -15,7 +15,7 @@ from radejax.simulation.config import FULL_SIZE
 
 
 def get_config(arg: str | None = None) -> Config:
-    """Return the complete config; `arg` is None or "short"."""
+    """Returns the complete config; `arg` is None or "short"."""
     (length,) = parse_options(arg, ("short",))
     frames = {"train_sequences": 800}
     if length == "short":
