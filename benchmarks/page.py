@@ -100,8 +100,8 @@ def devices_table(runs):
         f"### {runs[-1]['device']}",
         "",
         "| stage | dtype | frames | radejax, per frame | compared with, per frame | speedup | "
-        "greatest difference | memory | compilation | |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "greatest difference | calls | memory | compilation | |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     rows = [(row, run["platform"]) for run in runs for row in run["rows"]]
     lines += [row_text(*row) for row in rows if "refused" not in row[0]]
@@ -147,6 +147,7 @@ def row_text(row, where):
         "; ".join(f"{name} {cell(name)}" for name in others) or "-",
         "; ".join(ratios) or "-",
         "-" if row["error"] is None else f"{row['error']:.0e}",
+        str(row["repeats"]),
         "-" if row["mib"] is None else f"{row['mib']:.0f} MiB",
         "-" if row.get("compile_s") is None else duration(row["compile_s"]),
         row["note"],

@@ -85,7 +85,7 @@ CLASS_SETS = ("all", "sedan")
 
 
 def get_config(arg: str | None = None) -> Config:
-    """Return the complete config; see the module docstring for `arg`."""
+    """Returns the complete config; see the module docstring for `arg`."""
     radenet = load_module(pathlib.Path(__file__).with_name("radenet.py"))
     variant, preset, sigma, classes, release = parse_options(
         arg, VARIANTS, PRESETS, radenet.SIGMAS, CLASS_SETS, radenet.RELEASES
@@ -120,7 +120,7 @@ def get_config(arg: str | None = None) -> Config:
 
 
 def radar_part(model: RadeNetOptions) -> RadeNetOptions:
-    """Return the options of only the radar branch of a model."""
+    """Returns the options of only the radar branch of a model."""
     names = RadeNetOptions.model_fields
     fields = {name: value for name, value in model if name in names}
     return RadeNetOptions(**fields | {"name": "radenet"})

@@ -4,7 +4,8 @@
 
 The quickstart's road scenes, measured by K-Radar's sensors: projections with 64 Doppler and 37
 elevation bins, and images of 1280 x 720 pixels for the figures. Widths and schedule are those of
-`quickstart:ablation`; `docs/results.md` lists the expected numbers.
+`quickstart:ablation`. The numbers of `docs/results.md` were made with the radar `ideal` by code
+before commit 07e885cf. This config simulates the radar `realistic`, for which none are stored.
 
 Option `short`: a run of two minutes that tests the installation and hardly learns anything.
 """
@@ -14,7 +15,7 @@ from radejax.simulation.config import FULL_SIZE
 
 
 def get_config(arg: str | None = None) -> Config:
-    """Return the complete config; `arg` is None or "short"."""
+    """Returns the complete config; `arg` is None or "short"."""
     (length,) = parse_options(arg, ("short",))
     frames = {"train_sequences": 800}
     if length == "short":

@@ -19,7 +19,7 @@ from radejax.simulation.config import SimulationOptions
 
 
 def get_config(arg: str | None = None) -> Config:
-    """Return the complete config; see the module docstring for `arg`."""
+    """Returns the complete config; see the module docstring for `arg`."""
     recipe, length = parse_options(arg, ("ablation",), ("short",))
     # One frame per sequence, as another scene is more informative than the next tenth
     # of a second. Rare classes are oversampled.
@@ -78,7 +78,7 @@ def get_config(arg: str | None = None) -> Config:
 
 
 def _with_recipe(config: Config) -> Config:
-    """Return a config with the settings of `docs/reports/2026-11-24_quickstart_tuning.md`."""
+    """Returns a config with the settings of `docs/reports/2026-11-24_quickstart_tuning.md`."""
     return config.replace(
         simulation={"train_sequences": 1600, "vru_density_scale": 5.0},
         # The input has mean 0.64 and standard deviation 0.044: without scaling, it is

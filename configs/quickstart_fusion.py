@@ -33,7 +33,7 @@ from radejax.models.options import (
 
 
 def get_config(arg: str | None = None) -> Config:
-    """Return the complete config; see the module docstring for `arg`."""
+    """Returns the complete config; see the module docstring for `arg`."""
     sensors, content, length, backbone = parse_options(
         arg, ("radar",), ("silhouettes",), ("short", "long"), ("pretrained", "resnet50")
     )
@@ -67,7 +67,7 @@ def get_config(arg: str | None = None) -> Config:
 
 
 def _with_camera(config: Config) -> Config:
-    """Return a config of DinoRADE with the radar branch of another config."""
+    """Returns a config of DinoRADE with the radar branch of another config."""
     simulation = config.simulation
     assert simulation is not None  # the quickstart simulates its data
     axes = QueryGridOptions.of_grid(simulation.make_grid())

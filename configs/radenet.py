@@ -123,7 +123,7 @@ RELEASES = {
 
 
 def get_config(arg: str | None = None) -> Config:
-    """Return the complete config; see the module docstring for `arg`."""
+    """Returns the complete config; see the module docstring for `arg`."""
     variant, preset, sigma, classes, release = parse_options(
         arg, VARIANTS, PRESETS, SIGMAS, CLASS_SETS, RELEASES
     )

@@ -13,7 +13,7 @@ from radejax.simulation.config import SimulationOptions
 
 
 def get_config(arg: str | None = None) -> Config:
-    """Return the complete config; there are no variants."""
+    """Returns the complete config; there are no variants."""
     parse_options(arg)
     return load_config("quickstart:ablation").replace(
         simulation=SimulationOptions(

@@ -55,6 +55,7 @@ from radejax.config import Config, load_config
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES
+from radejax.core.version import radejax_commit
 from radejax.data.kradar.folders import read_split
 from radejax.data.kradar.reduce import reduce_dataset
 from radejax.data.kradar.write import write_splits
@@ -365,7 +366,9 @@ def write_tables(
     comparer = Comparer(work, seeds, resamples)
     rows, claims = list(comparer.rows()), list(comparer.claims())
     made = tables(work.study, rows, claims)
-    content = {"rows": rows, "claims": claims, "resamples": resamples}
+    radar = work.simulation(work.study.cells[work.study.base], 0).radar.preset
+    content = {"radar": radar, "code": radejax_commit()}
+    content |= {"rows": rows, "claims": claims, "resamples": resamples}
     content["commands"] = {
         f"{name}, seed {seed}": work.command(name, seed)
         for name in work.study.cells
@@ -375,6 +378,8 @@ def write_tables(
     files.write_json(path.with_suffix(".json"), content)
     for suffix, style in ((".md", "markdown"), (".tex", "latex")):
         text = rendered(made, style, is_simulated=True)
+        if style == "markdown":
+            text = f"Radar `{radar}`, tables written by commit {content['code']}.\n\n{text}"
         files.write_text(path.with_suffix(suffix), text)
     click.echo(rendered([made[0], made[-1]], is_simulated=True))
     click.echo(f"written to {path}.md, .tex and .json")

@@ -37,7 +37,7 @@ COLOR_LIMITS = (
 def scene_of(
     frame: Frame, detector: radejax.Detector, title: str, roi: str
 ) -> radejax.Scene:
-    """Detect the objects of a frame and match them with its labels."""
+    """Detects the objects of a frame and matches them with its labels."""
     projection = frame.read_projection(detector.grid)
     return radejax.frame_scene(
         frame,
@@ -51,7 +51,7 @@ def scene_of(
 
 
 def bad_visibility_sequence(frames: radejax.KRadar) -> list[Frame]:
-    """Return the first sequence in fog or snow whose first frame has enough objects."""
+    """Returns the first sequence in fog or snow whose first frame has enough objects."""
     sequences: dict[int, list[Frame]] = {}
     for frame in frames:
         sequences.setdefault(frame.sequence, []).append(frame)
@@ -64,7 +64,7 @@ def bad_visibility_sequence(frames: radejax.KRadar) -> list[Frame]:
 
 
 def draw_animation(data: pathlib.Path, path: pathlib.Path) -> None:
-    """Draw one sequence: camera and radar map, with what is found, missed and false."""
+    """Draws one sequence: camera and radar map, with what is found, missed and false."""
     sequence = bad_visibility_sequence(
         radejax.KRadar([radejax.simulate(SEQUENCES, data / "sequences")])
     )
@@ -89,7 +89,7 @@ def draw_animation(data: pathlib.Path, path: pathlib.Path) -> None:
 
 
 def draw_weathers(data: pathlib.Path, path: pathlib.Path) -> None:
-    """Draw the frame with the most objects of each kind of weather."""
+    """Draws the frame with the most objects of each kind of weather."""
     frames = radejax.KRadar([radejax.simulate(SCENES, data / "scenes")])
     detector = radejax.Detector.from_workdir(MODEL)
     scenes = [
@@ -100,7 +100,7 @@ def draw_weathers(data: pathlib.Path, path: pathlib.Path) -> None:
 
 
 def draw_reference_points(data: pathlib.Path, path: pathlib.Path) -> None:
-    """Draw the reference points on the first image."""
+    """Draws the reference points on the first image."""
     frame = radejax.KRadar([radejax.simulate(SCENES, data / "scenes")])[0]
     pixels, camera = radejax.front_view(frame)
     truth = radejax.Boxes.one_frame(frame.boxes, frame.classes)

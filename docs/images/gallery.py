@@ -50,7 +50,7 @@ OF_NOTEBOOKS: dict[str, tuple[str, int, Part]] = {
 
 
 def draw(data: pathlib.Path, out: pathlib.Path) -> None:
-    """Draw all thumbnails."""
+    """Draws all thumbnails."""
     out.mkdir(exist_ok=True)
     for name, (source, part) in OF_IMAGES.items():
         _save(Image.open(ROOT / "docs" / "images" / source), part, out / f"{name}.png")
@@ -72,7 +72,7 @@ def _figure_of_cell(notebook: str, cell: int) -> Image.Image:
 
 
 def _save(image: Image.Image, part: Part, path: pathlib.Path) -> None:
-    """Save a part of a figure in few colors, in the middle of a white thumbnail."""
+    """Saves a part of a figure in few colors, in the middle of a white thumbnail."""
     box = tuple(int(x * n) for x, n in zip(part, 2 * image.size, strict=True))
     shown = image.convert("RGB").crop(box)
     shown.thumbnail(SIZE, Image.Resampling.LANCZOS)
@@ -86,7 +86,7 @@ def _stored(name: str) -> dict:
 
 
 def draw_calibration(_: pathlib.Path) -> Figure:
-    """Draw the calibration error of scores and of probabilities by class."""
+    """Draws the calibration error of scores and of probabilities by class."""
     rows = _stored("calibration.json")["calibration_errors"]
     rows = [
         row for row in rows if row["min_score"] == min(r["min_score"] for r in rows)
@@ -107,7 +107,7 @@ def draw_calibration(_: pathlib.Path) -> Figure:
 
 
 def draw_robustness(_: pathlib.Path) -> Figure:
-    """Draw the AP at the lowest and highest value of each field of the radar."""
+    """Draws the AP at the lowest and highest value of each field of the radar."""
     found = _stored("ablations/robustness.json")["trained on realistic"]["ap"]
     fields: dict[str, list[float]] = {}
     for name, ap in found.items():
@@ -127,7 +127,7 @@ def draw_robustness(_: pathlib.Path) -> Figure:
 
 
 def draw_own_radar(data: pathlib.Path) -> Figure:
-    """Draw the frame with the most boxes of the simulated recording."""
+    """Draws the frame with the most boxes of the simulated recording."""
     root = data / "own_radar"
     if not (root / "boxes.csv").exists():
         own_radar.simulate(root, 8)
@@ -139,7 +139,7 @@ def draw_own_radar(data: pathlib.Path) -> Figure:
 
 
 def draw_cfar(data: pathlib.Path) -> Figure:
-    """Draw the detections of CFAR in the frame with the most boxes."""
+    """Draws the detections of CFAR in the frame with the most boxes."""
     frames = _simulated(data / "cfar", test_sequences=8, image_width=0)
     frame = max(frames, key=lambda frame: len(frame.boxes))
     projection = frame.read_projection(frames.grid)
@@ -158,7 +158,7 @@ def draw_cfar(data: pathlib.Path) -> Figure:
 
 
 def draw_silhouettes(data: pathlib.Path) -> Figure:
-    """Draw the oracle image with the most kinds of objects."""
+    """Draws the oracle image with the most kinds of objects."""
     frames = _simulated(data / "oracle", test_sequences=8, camera_mode="oracle")
     frame = max(frames, key=lambda frame: len(set(frame.classes)))
     pixels, _ = radejax.front_view(frame)

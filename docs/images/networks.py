@@ -322,7 +322,7 @@ def dinorade(net: Network) -> Sheet:
 
 
 def _totals(sheet: Sheet, net: Network) -> Sheet:
-    """Add the numbers of trained and frozen parameters below DinoRADE."""
+    """Adds the numbers of trained and frozen parameters below DinoRADE."""
     frozen = ["image_backbone"] if net.model.options.image.freeze else []
     trained = [name for name in net.parameters if name not in frozen]
     total = f"DinoRADE: {net.count(*trained)} parameters trained"

@@ -116,7 +116,7 @@ def _against_cfar() -> tuple[float, float, float]:
 
 
 def verdict(claim: Claim, low: float, high: float) -> str:
-    """Return the verdict by the rule of the page."""
+    """Returns the verdict by the rule of the page."""
     supported, not_reproduced, inconclusive, not_tested = VERDICTS
     if not claim.is_tested:
         return not_tested
@@ -128,7 +128,7 @@ def verdict(claim: Claim, low: float, high: float) -> str:
 
 
 def draw_claims(path: pathlib.Path) -> None:
-    """Draw a forest plot: one row per claim with its interval, and the paper's size."""
+    """Draws a forest plot: one row per claim with its interval, and the paper's size."""
     cfar = Claim("RADE-Net beats CFAR, radar realistic", "", "", "")
     found = [(cfar, *_against_cfar())] + [(c, *_stored(c)) for c in CLAIMS]
     figure = new_figure(8.0, 8.0, dpi=140)
@@ -169,7 +169,7 @@ def draw_claims(path: pathlib.Path) -> None:
 
 
 def draw_weather(path: pathlib.Path) -> None:
-    """Draw AP by weather with and without the camera, and the difference."""
+    """Draws AP by weather with and without the camera, and the difference."""
     rows = {(r["cell"], r["cls"], r["condition"]): r for r in _table("camera")["rows"]}
     (_, fusion, radar), count = _CAMERA, len(WEATHERS)
     figure = new_figure(8.0, 6.4, dpi=140, layout="constrained")
@@ -212,7 +212,7 @@ def _with_roads(weather: str) -> str:
 
 
 def draw_camera_share(path: pathlib.Path) -> None:
-    """Draw the camera's weight over the grid, and how it differs by what covers the lens."""
+    """Draws the camera's weight over the grid, and how it differs by what covers the lens."""
     stored = json.loads((RESULTS.parent / "camera_share.json").read_text("utf-8"))
     grid = SimulationOptions().make_grid()
     edges = bin_edges(np.rad2deg(grid.azimuth_rad)), bin_edges(grid.range_m)

@@ -61,7 +61,7 @@ class Block:
         return self.x, self.y + self.height / 2
 
     def svg(self) -> str:
-        """Return the elements of the block."""
+        """Returns the elements of the block."""
         x, y = self.left[0], self.top[1]
         dashes = f' stroke="{ARROW_COLOR}" stroke-width="3" stroke-dasharray="6 3"'
         dashes = dashes if self.is_frozen else ""
@@ -101,17 +101,17 @@ class Sheet:
         height: float = 66.0,
         is_frozen: bool = False,
     ) -> Block:
-        """Add a block."""
+        """Adds a block."""
         made = Block(x, y, width, height, title, color, tuple(lines), is_frozen)
         self.blocks.append(made)
         return made
 
     def arrow(self, *way: Point) -> None:
-        """Add an arrow along points."""
+        """Adds an arrow along points."""
         self.arrows.append(way)
 
     def svg(self) -> str:
-        """Return the figure as an SVG document."""
+        """Returns the figure as an SVG document."""
         size = f'viewBox="0 0 {self.width:g} {self.height:g}" width="{self.width:g}"'
         lines = [
             f'<svg xmlns="http://www.w3.org/2000/svg" {size} role="img">',

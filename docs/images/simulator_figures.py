@@ -46,7 +46,7 @@ UNSEEN = {"color": "#E69F00", "lw": 1.2, "ls": (0, (3, 1))}
 
 
 def draw_scene(weather, environment, time, seed, path):
-    """Draw camera image, range-azimuth, azimuth-elevation and range-Doppler maps."""
+    """Draws camera image, range-azimuth, azimuth-elevation and range-Doppler maps."""
     rng = np.random.default_rng(seed)
     sequence = make_sequence(seed, (environment, time, weather), 60, rng)
     simulator = SequenceSimulator(sequence, SimulationOptions(**FULL_SIZE, seed=seed))
@@ -73,7 +73,7 @@ def draw_scene(weather, environment, time, seed, path):
 
 
 def draw_maps(axes, power_db):
-    """Draw three maps on one scale, each the maximum over the axes that it does not show."""
+    """Draws three maps on one scale, each the maximum over the axes that it does not show."""
     ground, angles, doppler = axes
     centers = GRID.bin_centers_ego()
     colors = {"cmap": COLOR_MAP, "vmin": LIMITS_DB[0], "vmax": LIMITS_DB[1]}
@@ -106,7 +106,7 @@ def draw_maps(axes, power_db):
 
 
 def draw_boxes(axis, legend_axis, frame, is_visible):
-    """Draw boxes in the field of view: flag `R` white with name, `L` orange and dashed.
+    """Draws boxes in the field of view: flag `R` white with name, `L` orange and dashed.
 
     The legend is below the image, where it covers no part of the map.
     """
@@ -136,7 +136,7 @@ def draw_boxes(axis, legend_axis, frame, is_visible):
 
 
 def draw_statistics(path):
-    """Draw mean power of one frame, and profiles and echoes of all scenes beside K-Radar's."""
+    """Draws mean power of one frame, and profiles and echoes of all scenes beside K-Radar's."""
     levels = []
     for weather, environment, time, seed in SCENES:
         rng = np.random.default_rng(seed)
@@ -182,7 +182,7 @@ def draw_statistics(path):
 
 
 def draw_bands(axis, levels, noise_db):
-    """Draw the median of every range band: of the real map, and of the simulated ones."""
+    """Draws the median of every range band: of the real map, and of the simulated ones."""
     for place, ((low, high), real_db) in enumerate(REAL_PROFILE_DB.items()):
         is_in = (GRID.range_m >= low) & (GRID.range_m < high)
         found = [np.median(x[is_in]) - n for x, n in zip(levels, noise_db, strict=True)]
@@ -203,7 +203,7 @@ def draw_bands(axis, levels, noise_db):
 
 
 def draw(out):
-    """Draw all scenes and the statistics into a folder."""
+    """Draws all scenes and the statistics into a folder."""
     for scene in SCENES:
         draw_scene(*scene, out / f"simulator_{scene[0]}.png")
     draw_statistics(out / "simulator_statistics.png")

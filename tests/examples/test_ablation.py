@@ -102,7 +102,10 @@ def test_what_is_missing_is_run_and_judged(
     verdicts = {claim["text"]: claim["verdict"] for claim in content["claims"]}
     assert verdicts["0.75 is best for all classes"] == "supported"
     assert verdicts["sanity check: labels matter"] == "supported"
-    assert "supported" in (tmp_path / "table_sigma.md").read_text()
+    assert content["radar"] == "realistic"
+    text = (tmp_path / "table_sigma.md").read_text()
+    assert "supported" in text
+    assert "Radar `realistic`" in text
     assert r"\begin{tabular}" in (tmp_path / "table_sigma.tex").read_text()
 
 

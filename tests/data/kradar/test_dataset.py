@@ -186,6 +186,9 @@ def test_published_counts_of_the_training_split(shared):
     data = KRadar(labels=shared / "data/kradar/labels_v2_1.zip", split="train")
     assert len(data) == 17458
     assert list(data.class_counts().values()) == [28074, 5800, 2318, 190, 586]
+    counts = data.summary().counts
+    assert counts["objects in the label files"] == 60012
+    assert counts["objects left out by visibility"] == 22909
     boxes = np.concatenate([frame.boxes for frame in data])
     classes = np.concatenate([frame.classes for frame in data])
     x, y, z = boxes[:, :3].T
