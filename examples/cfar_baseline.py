@@ -30,7 +30,7 @@ from radejax.data.kradar import KRadar
 from radejax.data.projection import decode
 from radejax.data.records import Records, open_projections
 from radejax.evaluation.boxes import tables_from_frames
-from radejax.evaluation.report import Report, write_report
+from radejax.evaluation.report import Origin, Report, write_report
 from radejax.evaluation.results import ReportOptions
 from radejax.simulation.radar.tensor import RadarParameters
 
@@ -94,8 +94,7 @@ def run_baseline(
             min_score=score_threshold,
             bootstrap=bootstrap,
         ),
-        run="CFAR",
-        left_out=frames.summary().counts,
+        Origin("CFAR", left_out=frames.summary().counts),
     )
 
 

@@ -356,24 +356,20 @@ def read_frames(
         any_visibility: Whether objects of every visibility flag are read.
         **paths: Other paths of `config.data`, such as `labels`; the config's if None.
     """
-    from radejax.core.structures import CLASSES
     from radejax.data import dataset
-    from radejax.data.options import DataOptions
 
-    options = DataOptions()
-    classes: Sequence[str] = CLASSES
-    if config is not None:
-        settings = radejax.load_config(config) if isinstance(config, str) else config
-        options, classes = settings.data, settings.classes
-    options = options.replace(
+    if isinstance(config, str):
+        config = radejax.load_config(config)
+    settings = config or radejax.Config()
+    options = settings.data.replace(
         roots=roots,
-        label_version=version or options.label_version,
+        label_version=version or settings.data.label_version,
         sequences=sequence_numbers or (),
         weather=weather or (),
-        visibility=None if any_visibility else options.visibility,
+        visibility=None if any_visibility else settings.data.visibility,
         **{name: path for name, path in paths.items() if path is not None},
     )
-    return dataset.read_frames(options, classes)
+    return dataset.read_frames(options, settings.classes)
 
 
 camera_calibration = click.option(

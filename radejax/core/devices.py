@@ -329,7 +329,8 @@ def stop_on_signal(mesh: Mesh) -> Iterator[Callable[[], bool]]:
         if jax.process_count() == 1:
             return event.is_set()
         rows = np.full(len(mesh.local_devices), event.is_set())
-        found, before = before, any_of(put_batch(rows, mesh))
+        found = before
+        before = any_of(put_batch(rows, mesh))
         return found is not None and bool(found)
 
     numbers = [signal.SIGTERM, signal.SIGINT, signal.SIGUSR1]

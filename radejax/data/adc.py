@@ -219,9 +219,9 @@ def adc_to_power(
     is_same = jnp.iscomplexobj(samples) == radar.is_complex
     require(is_same, "type of samples", samples.dtype.name, expected)
     if calibration is not None:
-        found, channels = np.shape(calibration), radar.shape[1:3]
-        expected = f"{channels}: tx_m, rx_m of the radar"
-        require(found == channels, "shape of calibration", found, expected)
+        found = np.shape(calibration)
+        expected = f"{radar.shape[1:3]}: tx_m, rx_m of the radar"
+        require(found == radar.shape[1:3], "shape of calibration", found, expected)
     if not isinstance(samples, jax.core.Tracer):
         _check_values(np.asarray(samples))
     power: Float[jax.Array, "D R E A"] = _to_power(samples, radar, calibration)
@@ -268,9 +268,8 @@ def _to_power(
         factors = factors * jnp.asarray(calibration)[None, :, :, None]
     signals = (signals * factors).reshape(num_doppler, num_tx * num_rx, -1)
     # Products of real matrices are several times faster than complex ones on CPUs.
-    steering = radar.steering() * weights[:, None]  # [TQ, EA]
-    real, imag = steering.real.astype(np.float32), steering.imag.astype(np.float32)
-    matrix = np.block([[real, imag], [-imag, real]])
+    steering = (radar.steering() * weights[:, None]).astype(np.complex64)  # [TQ, EA]
+    matrix = np.block([[steering.real, steering.imag], [-steering.imag, steering.real]])
 
     def beams(signal: Complex[jax.Array, "TQ R"]) -> Float[jax.Array, "R E A"]:
         parts = jnp.concatenate([signal.real, signal.imag])
@@ -317,7 +316,7 @@ def read_ti_bin(
         Texas Instruments, "Mmwave Radar Device ADC Raw Data Capture", SWRA581.
     """
     num_parts = 2 if radar.is_complex else 1
-    chirps, num_rx, num_samples = radar.shape[:2], *radar.shape[2:]
+    *chirps, num_rx, num_samples = radar.shape
     words = math.prod(radar.shape) * num_parts
     frames = os.path.getsize(path) / (2 * words)
     if frames % 1 or not 0 <= frame < frames:

@@ -27,7 +27,7 @@ from radejax.geometry.camera import CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
 
 _MAX_YAW_RAD = 10.0  # larger angles are taken to be degrees
-_BEV_Z_M, _BEV_HEIGHT_M = 0.0, 1.5  # of boxes whose labels have neither
+_BEV_Z_AND_HEIGHT_M = (0.0, 1.5)  # of boxes whose labels have neither
 
 
 @dataclasses.dataclass
@@ -129,7 +129,7 @@ class LabelledFrame:
     def __post_init__(self) -> None:
         boxes = np.asarray(self.boxes)
         if boxes.ndim == 2 and boxes.shape[1] == 5:
-            boxes = np.insert(boxes, (2, 4), (_BEV_Z_M, _BEV_HEIGHT_M), axis=1)
+            boxes = np.insert(boxes, (2, 4), _BEV_Z_AND_HEIGHT_M, axis=1)
             object.__setattr__(self, "boxes", boxes)
 
     @property

@@ -481,13 +481,13 @@ def _renumbered(
 
     Frames are identified by their keys: ids differ if a run was evaluated on a part.
     """
-    keys, expected = frame_keys(frames), frame_keys(like)
-    if other := sorted(set(keys) ^ set(expected)):
+    keys = frame_keys(frames)
+    ids = dict(zip(frame_keys(like), frame_ids(like), strict=True))
+    if other := sorted(set(keys) ^ set(ids)):
         raise UserError(
-            f"the runs have different frames ({len(expected)} and {len(keys)}), such as "
+            f"the runs have different frames ({len(ids)} and {len(keys)}), such as "
             f"{other[0]}: choose common ones by --sequences, --weather or --split"
         )
-    ids = dict(zip(expected, frame_ids(like), strict=True))
     new = np.array([ids[key] for key in keys], np.int64)
     truth, found = (
         dataclasses.replace(
@@ -495,5 +495,5 @@ def _renumbered(
         )
         for table in (truth, found)
     )
-    order = [keys.index(key) for key in expected]
+    order = [keys.index(key) for key in ids]
     return truth, found, take({**frames, "frame": new}, np.array(order, np.int64))

@@ -24,7 +24,7 @@ from radejax.data.kradar import KRadar
 from radejax.evaluation import boxes
 from radejax.evaluation.boxes import Columns, column_names, columns_of_boxes
 from radejax.evaluation.kitti import find_root, read_kitti
-from radejax.evaluation.report import Report, write_report
+from radejax.evaluation.report import Origin, Report, write_report
 from radejax.evaluation.results import ReportOptions
 
 LOW_SCORE = 0.1
@@ -344,13 +344,5 @@ def evaluate_files(
             "these; `radejax evaluate` with --min-score stores lower ones"
         )
     options = options.replace(min_score=max(low, options.min_score))
-    return write_report(
-        truth,
-        found,
-        frames,
-        out_dir,
-        options,
-        run=run,
-        left_out=left_out,
-        warnings=warnings,
-    )
+    origin = Origin(run, left_out=left_out, warnings=warnings)
+    return write_report(truth, found, frames, out_dir, options, origin)

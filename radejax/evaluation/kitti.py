@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import pathlib
 import re
-from collections.abc import Iterable
 
 import numpy as np
 
@@ -107,20 +106,20 @@ def write_kitti(
     return len(truth)
 
 
-def prediction_texts(boxes: Boxes, frames: Iterable[int]) -> list[str]:
-    """Formats the predictions of each frame as one text in the format of K-Radar's tools.
+def prediction_text(boxes: Boxes, frame: int) -> str:
+    """Formats the predictions of a frame as a text in the format of K-Radar's tools.
 
-    The texts have no final newline. A frame without detections has the line "dummy".
+    It has no final newline. A frame without detections has the line "dummy".
 
     Args:
         boxes: Predictions, as `Detections.to_boxes` returns them.
-        frames: Indices of the frames to format.
+        frame: Index of the frame to format.
 
     Raises:
         UserError: K-Radar has no key for one of the classes.
     """
     found = _lines(boxes.columns(), scored=True)
-    return ["\n".join(found.get(frame, [DUMMY])) for frame in frames]
+    return "\n".join(found.get(frame, [DUMMY]))
 
 
 def _lines(table: Columns, *, scored: bool) -> dict[int, list[str]]:

@@ -25,6 +25,7 @@ import itertools
 import json
 import pathlib
 import re
+import types
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -77,18 +78,35 @@ class Report:
     data: EvaluationSet
 
 
+class Origin(NamedTuple):
+    """Where evaluated predictions come from, as a report states it.
+
+    Attributes:
+        run: Name of the run in tables.
+        step: Step of the model; None if it is not known.
+        data_name: Name of the data set; None if it is not known.
+        left_out: Counts of what was read and skipped when loading, by reason.
+        warnings: Warnings of loading, which are printed in the report.
+    """
+
+    run: str = "radejax"
+    step: int | None = None
+    data_name: str | None = None
+    left_out: Mapping[str, int] = types.MappingProxyType({})
+    warnings: Sequence[str] = ()
+
+
+UNKNOWN = Origin()
+
+
 def write_report(
     ground_truth: AnyBoxes,
     predictions: AnyBoxes,
     frames: Columns,
     out_dir: PathLike,
     options: ReportOptions,
+    origin: Origin = UNKNOWN,
     *,
-    run: str = "radejax",
-    step: int | None = None,
-    data_name: str | None = None,
-    left_out: Mapping[str, int] | None = None,
-    warnings: Sequence[str] = (),
     choosing: EvaluationSet | None = None,
     draw_scenes: Callable[[EvaluationSet, pathlib.Path], Iterable[SceneFigure]]
     | None = None,
@@ -103,11 +121,7 @@ def write_report(
         out_dir: Folder of the report. An earlier report in it is replaced when all files
             are written.
         options: Settings of the evaluation.
-        run: Name of the run in tables.
-        step: Step of the model; None if it is not known.
-        data_name: Name of the data set; None if it is not known.
-        left_out: Counts of what was read and skipped when loading, by reason.
-        warnings: Warnings of loading, which are printed in the report.
+        origin: Where the predictions come from.
         choosing: Validation split, on which score thresholds are chosen. If None, they are
             chosen on the evaluated frames, except on those of a test split.
         draw_scenes: Function from the evaluation set and the folder to the figures of frames
@@ -131,9 +145,9 @@ def write_report(
     # The split is that of all frames, or None if it is unknown or differs.
     splits = np.unique(np.asarray(frames.get("split", [])).astype(str))
     metrics: JsonObject = {
-        "run": run,
-        "step": step,
-        "data": data_name,
+        "run": origin.run,
+        "step": origin.step,
+        "data": origin.data_name,
         "radejax": __version__,
         "commit": radejax_commit(),
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
@@ -143,8 +157,8 @@ def write_report(
         "num_frames": int(data.frame.size),
         "num_ground_truth": len(data.gt),
         "num_predictions": len(data.pred),
-        "left_out": {**(left_out or {}), **exclusion_counts(data, options)},
-        "warnings": [*warnings, *analysis.sanity_checks(data)],
+        "left_out": {**origin.left_out, **exclusion_counts(data, options)},
+        "warnings": [*origin.warnings, *analysis.sanity_checks(data)],
         "intervals": f"{options.bootstrap} resamples of sequences"
         if any(result.has_interval for result in results)
         else "none: they need --bootstrap and frames of two sequences or more",
@@ -157,7 +171,7 @@ def write_report(
     }
     metrics = plain(metrics)
     by_key = {result.key: result for result in results}
-    tables = RunTables(run, by_key, options, metrics["split"])
+    tables = RunTables(origin.run, by_key, options, metrics["split"])
     text = _console_text(metrics, tables)
     built = _all_tables(metrics, tables)
     with files.swapped_in(out_dir, *STALE) as folder:
@@ -184,7 +198,7 @@ def write_report(
             write_kitti(
                 folder / "kitti", *data.evaluated(), frames, score_threshold=least
             )
-        origin = f"{run}, {describe(metrics)}"
+        description = f"{origin.run}, {describe(metrics)}"
         curves = {}
         if options.plots:
             from radejax.visualize.style import save_figure
@@ -192,7 +206,7 @@ def write_report(
             curves = _draw_curves(data, frames, options)
             curves |= _draw_scores(data, metrics["thresholds"]["chosen"], options)
             for name, figure in curves.items():
-                save_figure(figure, folder / f"{name}.{options.figures}", origin)
+                save_figure(figure, folder / f"{name}.{options.figures}", description)
         scenes = () if draw_scenes is None else draw_scenes(data, folder)
         write_html(folder / "report.html", metrics, built, curves, scenes)
     return Report(text, metrics, results, pathlib.Path(out_dir), data)
@@ -322,7 +336,8 @@ def _thresholds(
     """
     chosen_on = "the validation split"
     if choosing is None and "test" not in splits:
-        choosing, chosen_on = data, "the evaluated frames themselves"
+        choosing = data
+        chosen_on = "the evaluated frames themselves"
     points: dict[str, dict[str, float]] = {}
     for curve in [] if choosing is None else _class_curves(choosing, options):
         chosen = scores.choose_thresholds(curve, options.wanted_precision)

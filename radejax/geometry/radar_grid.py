@@ -490,12 +490,12 @@ class RadarGrid(ArrayValues):
             >>> maps = jnp.zeros((1, 256, 107, 5)), jnp.zeros((1, 256, 107, 8))
             >>> RadarGrid.kradar().check_maps(*maps)
         """
-        logits, params = heatmap.shape, box_params.shape
+        logits = heatmap.shape
         bins = (self.num_range, self.num_azimuth)
-        is_maps = len(logits) == 4 and params == (*logits[:3], 8)
+        is_maps = len(logits) == 4 and box_params.shape == (*logits[:3], 8)
         if not is_maps or logits[1:3] != bins:
             raise ValueError(
-                f"maps have shapes {logits} and {params}, expected [B, R, A, C] and "
+                f"maps have shapes {logits} and {box_params.shape}, expected [B, R, A, C] and "
                 f"[B, R, A, 8] on the grid's {bins[0]} x {bins[1]} bins (range, azimuth): "
                 "pass the grid of the maps, padded if the model pads and does not crop"
             )

@@ -13,6 +13,7 @@ import logging
 import pathlib
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -247,6 +248,37 @@ def _of_files(
     return FrameInputs(keys, found, found.__getitem__, views)
 
 
+def _write_json(path: pathlib.Path, boxes: Boxes, frame: int, key: str) -> None:
+    files.write_json(path, [{"frame": key, **box} for box in boxes.to_list()])
+
+
+def _write_kitti(path: pathlib.Path, boxes: Boxes, frame: int, key: str) -> None:
+    files.write_text(path, f"{kitti.prediction_text(boxes, frame)}\n")
+
+
+class _Format(NamedTuple):
+    """How boxes are written.
+
+    Attributes:
+        file: Name of the file of a frame, with its key or its position.
+        write: Function that writes the boxes of a frame, by position and key, to its file;
+            None if the boxes of all frames are written to one table at the end.
+        listing: File that lists the frames, if the files are numbered as those of K-Radar's
+            tools, which have no columns for outputs of the model's own.
+    """
+
+    file: str
+    write: Callable[[pathlib.Path, Boxes, int, str], None] | None
+    listing: tuple[str, ...] = ()
+
+
+_FORMATS = {
+    "json": _Format("{key}.json", _write_json),
+    "kitti": _Format("preds/{frame:06d}.txt", _write_kitti, listing=("frames.json",)),
+    "csv": _Format("{key}.json", None),
+}
+
+
 def detect_files(
     detector: Detector,
     inputs: FrameInputs,
@@ -290,6 +322,7 @@ def detect_files(
     detector = detector.replace()  # its counters start at zero
     keys = inputs.keys
     out = files.as_path(out)
+    kind = _FORMATS[file_format]
     names, manifest = _claim(detector, keys, out, file_format)
     states = [inputs.state(frame) for frame in range(len(keys))]
     done = {i for i, x in enumerate(states) if manifest.is_done(names[i], x)}
@@ -316,30 +349,20 @@ def detect_files(
         count["boxes"] += len(boxes)
         count["truncated"] += boxes.num_truncated
         count["clipped"] += int(boxes.is_clipped.sum())
-        if file_format == "csv":
+        if kind.write is None:
             found.append(boxes)
             continue
-        if file_format == "kitti":
-            (text,) = kitti.prediction_texts(boxes, [frame])
-            files.write_text(out / names[frame], f"{text}\n")
-        else:
-            rows = [{"frame": keys[frame], **box} for box in boxes.to_list()]
-            files.write_json(out / names[frame], rows)
+        kind.write(out / names[frame], boxes, frame, keys[frame])
         add(out, names[frame], states[frame])
     for frame in failed:
         add(out, names[frame], None)
-    if file_format == "csv":
-        _write_csv(
-            out / "boxes.csv",
-            Boxes.concatenate(found or [Boxes.one_frame([], [], [])]),
-            keys,
-        )
+    if kind.write is None:
+        _write_csv(out / "boxes.csv", found, keys)
     config = detector.saved.config
-    own = [
-        *config.model.outputs,
-        *(["probability"] if config.decode.calibration else []),
-    ]
-    if file_format == "kitti" and own:
+    own = list(config.model.outputs)
+    if config.decode.calibration:
+        own.append("probability")
+    if kind.listing and own:
         text = "the format kitti has no columns for %s: not written"
         _log.warning(text, ", ".join(own))
     if detector.num_frames > 1:
@@ -350,29 +373,29 @@ def detect_files(
 
 
 def _claim(
-    detector: Detector, keys: list[str], out: pathlib.Path, kind: str
+    detector: Detector, keys: list[str], out: pathlib.Path, file_format: str
 ) -> tuple[list[str], Manifest]:
     """Describes the boxes in their folder, or opens that of the same detection.
 
     Returns:
         The file of every frame, and the description.
     """
-    names = [f"{key.replace('/', '_')}.json" for key in keys]
-    if kind == "kitti":
-        names = [f"preds/{frame:06d}.txt" for frame in range(len(keys))]
+    kind = _FORMATS[file_format]
+    stems = (key.replace("/", "_") for key in keys)
+    names = [kind.file.format(key=x, frame=i) for i, x in enumerate(stems)]
     options: files.JsonObject = {
-        "format": kind,
+        "format": file_format,
         "frames": keys,
         "step": detector.saved.step,
         "weights": weights_sha256(detector.variables)[:16],
         "config": detector.saved.config.without_data_paths(),
     }
-    of_kind = {"json": names, "kitti": [*names, "frames.json"], "csv": []}
+    made = [] if kind.write is None else [*names, *kind.listing]
     patterns = [f"*.{suffix}" for suffix in ("json", "txt", "csv")]
-    manifest = Manifest.claim(out, "boxes", options, of_kind[kind], patterns)
-    if kind == "kitti":
+    manifest = Manifest.claim(out, "boxes", options, made, patterns)
+    for name in kind.listing:
         table = {"frame": list(range(len(keys))), "name": keys}
-        files.write_json(out / "frames.json", table)
+        files.write_json(out / name, table)
     return names, manifest
 
 
@@ -422,8 +445,9 @@ def _single(
             yield frame, jax.tree.map(lambda x, row=row: x[row : row + 1], on_host)
 
 
-def _write_csv(path: pathlib.Path, boxes: Boxes, keys: Sequence[str]) -> None:
+def _write_csv(path: pathlib.Path, found: list[Boxes], keys: Sequence[str]) -> None:
     """Writes all boxes as one table with the keys of their frames."""
+    boxes = Boxes.concatenate(found or [Boxes.one_frame([], [], [])])
     with files.atomic_path(path) as temporary, open(temporary, "w") as file:
         # A column with several values per box becomes several columns.
         columns = {

@@ -84,6 +84,7 @@ INPUTS = ("projection", "tensor")
 RESULTS = ("boxes", "scores", "classes", "is_valid", "num_truncated", "num_invalid")
 
 _MODEL_CARD = pathlib.Path(__file__).with_name("model_card.md")
+_Z_ORIGINS = {"kradar": "LiDAR"}  # by the format of the training data
 _LEFT_OUT = (
     "the frozen DINOv3 weights, whose license restricts redistribution: download them "
     "from their owner and pass `image_backbone=FOLDER`"
@@ -247,9 +248,7 @@ def _readme(
         opset=_OPSET,
         runtime=_SMALLEST_RUNTIME,
         count=config.decode.max_detections,
-        z="LiDAR"
-        if config.data.format == "kradar"
-        else "origin of the training's labels",
+        z=_Z_ORIGINS.get(config.data.format, "origin of the training's labels"),
         left_out=_LEFT_OUT if content["left_out"] else "nothing",
         origin=_SIMULATED if is_simulated else _MEASURED,
         identity=_origin(content),

@@ -75,7 +75,8 @@ def checked(rows: Mapping[str, Mapping[str, Any]], name: str, value: Any) -> np.
         ValueError: The input has another shape or dtype.
     """
     array = np.asarray(value)
-    shape, dtype = rows[name]["shape"], np.dtype(rows[name]["dtype"])
+    shape = rows[name]["shape"]
+    dtype = np.dtype(rows[name]["dtype"])
     fits = array.dtype == dtype or array.dtype.kind == dtype.kind == "f"
     sizes = [m if n is None else n for n, m in zip(shape, array.shape, strict=False)]
     if not fits or len(shape) != array.ndim or tuple(sizes) != array.shape:

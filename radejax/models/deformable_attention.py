@@ -20,7 +20,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import flax.linen as nn
 import jax
@@ -72,6 +72,20 @@ class Linear(Layer):
         x = x.astype(self.dtype)
         y = jnp.matmul(x, kernel.astype(self.dtype), precision=self.precision)
         return y, bias
+
+
+class Queries(NamedTuple):
+    """The E queries of each of N bins. One sample may be shared by the batch.
+
+    Attributes:
+        scale: `[B, N, E]` factors; query e of bin n is `scale[n, e]` times its feature.
+        reference: `[B or 1, N, E, 2]` reference points, (x, y) in 0..1.
+        weights: `[B or 1, N, E]` weights of the queries in the sum.
+    """
+
+    scale: Float[jax.Array, "B N E"]
+    reference: Float[jax.Array, "#B N E 2"]
+    weights: Float[jax.Array, "#B N E"]
 
 
 class DeformableAttention(Layer):
@@ -134,9 +148,7 @@ class DeformableAttention(Layer):
             value.reshape(*value.shape[:3], heads, -1),
             offsets.reshape(*batch, heads, points, 2),
             logits.reshape(*batch, heads, points),
-            scale,
-            reference,
-            query_weights,
+            Queries(scale, reference, query_weights),
             offset_bias.reshape(heads, points, 2),
             logit_bias.reshape(heads, points),
             chunk_size=self.chunk_size,
@@ -164,9 +176,7 @@ def lifted_attention(
     value: Float[jax.Array, "B H W heads D"],
     offsets: Float[jax.Array, "B N heads P 2"],
     logits: Float[jax.Array, "B N heads P"],
-    scale: Float[jax.Array, "B N E"],
-    reference: Float[jax.Array, "#B N E 2"],
-    query_weights: Float[jax.Array, "#B N E"],
+    queries: Queries,
     offset_bias: Float[jax.Array, "heads P 2"],
     logit_bias: Float[jax.Array, "heads P"],
     *,
@@ -182,9 +192,7 @@ def lifted_attention(
         value: `[B, H, W, heads, D]` map to sample.
         offsets: `[B, N, heads, P, 2]` sampling offsets in pixels (x, y), without bias.
         logits: `[B, N, heads, P]` attention logits, without bias.
-        scale: `[B, N, E]` factors of the queries.
-        reference: `[B or 1, N, E, 2]` reference points, (x, y) in 0..1.
-        query_weights: `[B or 1, N, E]` weights of the queries in the sum.
+        queries: The queries of the bins.
         offset_bias: `[heads, P, 2]` bias of the offsets.
         logit_bias: `[heads, P]` bias of the logits.
         chunk_size: Bins per chunk; 0 selects a default for the platform that the function
@@ -199,8 +207,7 @@ def lifted_attention(
     offsets = jnp.moveaxis(offsets, 2, 1)
     logits = jnp.moveaxis(logits, 2, 1)
     # The geometry is either per sample or shared by the whole batch.
-    reference = jnp.broadcast_to(reference, (b, *reference.shape[1:]))
-    query_weights = jnp.broadcast_to(query_weights, (b, *query_weights.shape[1:]))
+    geometry = (jnp.broadcast_to(x, (b, *x.shape[1:])) for x in queries)
 
     def sample(
         value: jax.Array, offsets: jax.Array, logits: jax.Array, *shared: jax.Array
@@ -214,7 +221,7 @@ def lifted_attention(
         attention: jax.Array = jax.lax.map(head, by_head)
         return attention
 
-    arrays = (value, offsets, logits, scale, reference, query_weights)
+    arrays = (value, offsets, logits, *geometry)
     if b == 1:  # on a CPU, the gradient of a batch of one is slower
         return jnp.moveaxis(sample(*(x[0] for x in arrays)), 0, 1)[None]
     # This is not a loop over the samples: if the batch is split over devices, a loop would

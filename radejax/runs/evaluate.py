@@ -42,7 +42,7 @@ from radejax.evaluation.boxes import (
 )
 from radejax.evaluation.evaluation_set import EvaluationSet, Result
 from radejax.evaluation.html import SceneFigure
-from radejax.evaluation.report import STALE, Report, write_report
+from radejax.evaluation.report import STALE, Origin, Report, write_report
 from radejax.evaluation.results import (
     ReportOptions,
     compute_results,
@@ -257,10 +257,7 @@ class Evaluation:
                     self._table,
                     folder,
                     self._options,
-                    run=name,
-                    step=step,
-                    data_name=data_name,
-                    left_out=self._frames.summary().counts,
+                    Origin(name, step, data_name, self._frames.summary().counts),
                     choosing=others,
                     draw_scenes=draw_scenes,
                 )

@@ -75,9 +75,10 @@ def export_int8(
     num_bytes -= _quantize(folder, data, known)
     quantized = _aps(folder, config, data, frames)
     options = report_options(config)
-    (protocol, *_), data_name = options.protocols, data.describe()["name"]
+    protocol = options.protocols[0]
     least = options.settings_of(protocol)["score_threshold"]
     calibrated_on = f"{len(known)} frames of the {split} split"
+    data_name = data.describe()["name"]
     evaluated_on = f"{len(frames)} frames of the test split of {data_name}, "
     evaluated_on += f"by {protocol} with scores above {least:g}"
     content = files.read_object(folder / CONFIG_FILE)

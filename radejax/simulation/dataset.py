@@ -215,7 +215,8 @@ class Writer:
         """Writes the motion of the ego vehicle and of the labelled objects."""
         sequence = self.source.make(specs[0].sequence)
         tracks = sequence.tracks
-        ego, objects = [motion.EGO_HEADER], [motion.OBJECT_HEADER]
+        ego = [motion.EGO_HEADER]
+        objects = [motion.OBJECT_HEADER]
         for spec in specs:
             frame = sequence.frame(spec.scene_idx, self.options.label_distance_m)
             moved = frame.ego_velocity_mps[0], frame.ego_yaw_rate_radps

@@ -97,7 +97,8 @@ def _settings_of_debugging() -> Iterator[None]:
     0.10 drops it: while it traces the step, it turns the setting off and not on again.
     """
     settings = jax.config.values
-    is_nans, is_infs = settings["jax_debug_nans"], settings["jax_debug_infs"]
+    is_nans = settings["jax_debug_nans"]
+    is_infs = settings["jax_debug_infs"]
     is_debugging = is_nans or is_infs or settings["jax_disable_jit"]
     transfers = jax.transfer_guard("allow" if is_debugging else "disallow")
     with transfers, jax.debug_nans(is_nans), jax.debug_infs(is_infs):

@@ -8,7 +8,6 @@ to pixels with the calibration. The sensor offset must be added to boxes of labe
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from numpy.typing import ArrayLike
@@ -33,7 +32,6 @@ def draw_camera(
     ax: Axes | None = None,
     show_labels: bool = True,
     title: str = "",
-    lidar_m: Float[np.ndarray, "N 3"] | None = None,
     matches: style.Matches | None = None,
 ) -> Axes:
     """Draws the edges and the tinted front faces of 3D boxes on an image.
@@ -46,7 +44,6 @@ def draw_camera(
         ax: Axes to draw on; a new figure by default.
         show_labels: Whether to write class and score at the boxes.
         title: Title of the axes.
-        lidar_m: LiDAR points in the radar frame in meters, or None.
         matches: Matches of ground truth and predictions, or None.
 
     Returns:
@@ -75,9 +72,6 @@ def draw_camera(
     # Pixel centers are integers in imshow and half-integers in the calibration.
     ax.set(xlim=(-0.5, calibration.width - 0.5), ylim=(calibration.height - 0.5, -0.5))
     ax.apply_aspect()
-    if lidar_m is not None:
-        pixels, depth_m = calibration.project_ego(lidar_m)
-        style.draw_points(ax, pixels[calibration.in_image(pixels, depth_m)] - 0.5)
     labels = []
     for look, boxes in style.styled_sets(ground_truth, predictions, matches):
         labels += _draw_boxes(ax, calibration, boxes, look)

@@ -46,7 +46,8 @@ _POINTS_PER_EDGE = 8  # straight edges bend in the polar view
 _SCENE_PERCENTILES = (20.0, 99.5)
 _FOOT_IN = 1.3  # axis labels, legend and color bar below scenes
 _IMAGE_IN = 3.2  # width of the image to the left of a map
-_MAP_IN, _ROW_IN = 5.5, 2.4  # width of a map, height of a row
+_MAP_IN = 5.5  # width of a map
+_ROW_IN = 2.4  # height of a row
 _SCENE_LABEL_PT = (
     8.5  # legible when a page shows the figure at three quarters of its size
 )
@@ -88,7 +89,8 @@ def draw_map(
     x, y = np.moveaxis(grid.bin_centers_ego(), -1, 0)
     is_shown = ((x >= x0) & (x <= x1) & (y >= y0) & (y <= y1)).any(1)
     rows = np.flatnonzero(is_shown) if is_shown.any() else np.arange(grid.num_range)
-    first, last = max(rows[0] - 2, 0), min(rows[-1] + 3, grid.num_range)
+    first = max(rows[0] - 2, 0)
+    last = min(rows[-1] + 3, grid.num_range)
     # Edges are half a bin outside the centers; negative ranges are clipped to zero.
     range_bin = np.arange(first, last + 1) - 0.5
     range_bin = np.maximum(range_bin, grid.ego_to_bin(0.0, 0.0)[0])
@@ -96,7 +98,7 @@ def draw_map(
     edges = grid.bin_to_ego(range_bin[:, None], azimuth_bin[None])  # [R'+1, A+1, 2]
     ax.set_facecolor(_OUTSIDE_COLOR)
     shown = values[first:last]
-    ahead, left = edges[..., 0], edges[..., 1]
+    ahead, left = np.moveaxis(edges, -1, 0)
     horizontal, vertical = (ahead, left) if is_sideways else (left, ahead)
     mesh = style.draw_tiles(ax, horizontal, vertical, shown, color_limits)
     names = "x, ahead [m]", "y, left [m]"
@@ -188,7 +190,7 @@ def bin_edges(centers: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n+1"]:
 
 def to_polar(points: Float[np.ndarray, "*points 2"]) -> Float[np.ndarray, "*points 2"]:
     """Converts ground positions to azimuth in degrees, positive to the right, and range."""
-    x, y = points[..., 0], points[..., 1]
+    x, y = np.moveaxis(points, -1, 0)
     polar: np.ndarray = np.stack([np.rad2deg(-np.arctan2(y, x)), np.hypot(x, y)], -1)
     return polar
 
@@ -354,9 +356,12 @@ def _draw_view(ax: Axes, scene: Scene, *, show_labels: bool = True) -> None:
         predictions=scene.predictions,
         ax=ax,
         show_labels=show_labels,
-        lidar_m=scene.lidar_m,
         matches=scene.matches,
     )
+    if scene.lidar_m is not None:
+        pixels, depth_m = scene.camera.project_ego(scene.lidar_m)
+        # Pixel centers are integers in imshow and half-integers in the calibration.
+        style.draw_points(ax, pixels[scene.camera.in_image(pixels, depth_m)] - 0.5)
 
 
 def _extent_m(

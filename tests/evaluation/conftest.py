@@ -9,7 +9,7 @@ import pytest
 from radejax.core import files
 from radejax.evaluation.boxes import frame_keys, read_boxes, write_boxes
 from radejax.evaluation.files import Source
-from radejax.evaluation.report import write_report
+from radejax.evaluation.report import Origin, write_report
 from radejax.evaluation.results import ReportOptions
 
 from .scenes import random_scene
@@ -84,5 +84,5 @@ def two_runs(scene, tmp_path_factory):
             rows = np.random.default_rng(seed).random(len(found["score"])) < keep
             table = {k: v[rows] for k, v in found.items()}
             place = folder / run / f"seed{seed}" / "evaluation"
-            write_report(truth, table, frames, place, options, run=run)
+            write_report(truth, table, frames, place, options, Origin(run))
     return folder

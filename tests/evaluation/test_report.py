@@ -31,8 +31,10 @@ STORED = ReportOptions(
 def written(scene, tmp_path_factory):
     """Report of recorded frames, and its folder."""
     out = tmp_path_factory.mktemp("report")
-    loading = {"left_out": {"labels: not a class": 3}, "warnings": ["a warning"]}
-    return report.write_report(*scene, out, STORED, run="mine", **loading), out
+    origin = report.Origin(
+        "mine", left_out={"labels: not a class": 3}, warnings=["a warning"]
+    )
+    return report.write_report(*scene, out, STORED, origin), out
 
 
 def test_texts_are_the_stored_ones(written, assert_stored):
@@ -59,7 +61,9 @@ def test_simulated_frames_have_no_published_row_anywhere(
 ):
     truth, found, frames = scene
     frames = {**frames, "simulated": np.ones(30, bool)}
-    made = report.write_report(truth, found, frames, tmp_path, STORED, run="mine")
+    made = report.write_report(
+        truth, found, frames, tmp_path, STORED, report.Origin("mine")
+    )
     assert_stored(tmp_path / "report.txt", "simulated.txt")
     assert_stored(tmp_path / "tables.tex", "simulated.tex")
     assert all(row["name"].endswith("/simulated") for row in made.metrics["ap"])
@@ -125,9 +129,9 @@ def test_an_evaluation_that_fails_leaves_the_old_results(scene, tmp_path, monkey
     with monkeypatch.context() as patched:
         patched.setattr(report, "write_boxes", fill)
         with pytest.raises(DiskFullError, match="no space left on the disk of"):
-            report.write_report(*scene, out, OPTIONS, run="second")
+            report.write_report(*scene, out, OPTIONS, report.Origin("second"))
     assert content() == before
-    report.write_report(*scene, out, OPTIONS, run="third")
+    report.write_report(*scene, out, OPTIONS, report.Origin("third"))
     assert (out / "notes.txt") in content()
 
 

@@ -9,7 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.models.deformable_attention import DeformableAttention, lifted_attention
+from radejax.models.deformable_attention import (
+    DeformableAttention,
+    Queries,
+    lifted_attention,
+)
 
 from .plain_attention import plain_attention
 
@@ -51,9 +55,11 @@ def test_samples_by_hand():
         value.reshape(1, 2, 3, 1, 1),
         jnp.zeros((1, n, 1, 1, 2)),
         jnp.zeros((1, n, 1, 1)),
-        jnp.ones((1, n, 1)),
-        jnp.asarray(list(places)).reshape(1, n, 1, 2),
-        jnp.full((1, n, 1), 2.0),
+        Queries(
+            jnp.ones((1, n, 1)),
+            jnp.asarray(list(places)).reshape(1, n, 1, 2),
+            jnp.full((1, n, 1), 2.0),
+        ),
         jnp.zeros((1, 1, 2)),
         jnp.zeros((1, 1)),
         chunk_size=4,

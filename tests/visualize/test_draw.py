@@ -6,10 +6,11 @@ import sys
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.collections import LineCollection, QuadMesh
+from matplotlib.collections import LineCollection, PathCollection, QuadMesh
 
 from radejax.core.errors import UserError
 from radejax.core.structures import Boxes
+from radejax.geometry.camera import CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.visualize import draw, style
 from radejax.visualize.style import COLOR_MAP, Scene, save_figure
@@ -169,6 +170,25 @@ def test_drawing_leaves_pyplot_alone_and_works_in_threads(tmp_path):
     assert len(figure.axes) == 3  # camera, bird's-eye and polar view
     if "matplotlib.pyplot" in sys.modules:
         assert not sys.modules["matplotlib.pyplot"].get_fignums()
+
+
+def test_lidar_points_are_drawn_on_their_pixels():
+    points_m = np.array([[10.0, 1.0, 0.5], [-10.0, 0, 0], [10.0, 90.0, 0]])
+    image = np.zeros((72, 128, 3), np.uint8)
+    camera = CameraCalibration(
+        rotation=np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]),
+        translation_m=np.zeros(3),
+        intrinsics=np.array([100.0, 100.0, 64.0, 36.0]),
+        distortion=np.zeros(5),
+        width=128,
+        height=72,
+        radar_from_lidar_m=np.zeros(3),
+    )
+    shown = scene(image=image, camera=camera, lidar_m=points_m)
+    (ax,) = (ax for ax in draw.draw_frame(shown).axes if ax.images)
+    (scatter,) = (x for x in ax.collections if isinstance(x, PathCollection))
+    # u = 64 - 100 / 10, v = 36 - 50 / 10; the others are behind the camera or beside it.
+    np.testing.assert_allclose(scatter.get_offsets(), [[53.5, 30.5]])
 
 
 def test_map_shows_every_bin_of_a_partial_extent():

@@ -162,10 +162,10 @@ def _check_objects(number: int, frames: Sequence[Frame], data: KRadar) -> None:
     problems = {}
     num_seen = sum(len(frame.boxes) for frame in frames)
     if num_seen < MIN_SEEN * len(labels):
-        range_m, azimuth = data.grid.fov_range_m, np.rad2deg(data.grid.fov_azimuth_rad)
+        azimuth = np.rad2deg(data.grid.fov_azimuth_rad)
         problems["objects out of view"] = (
             f"{len(labels) - num_seen} of {len(labels)} objects that are visible to the "
-            f"radar are not in its view of {range_m:g} m and {azimuth:.3g} deg"
+            f"radar are not in its view of {data.grid.fov_range_m:g} m and {azimuth:.3g} deg"
         )
     boxes = np.array([label.box for label in labels])
     # In K-Radar, the largest yaw of a sequence in degrees is below 2 or above 5.

@@ -240,11 +240,11 @@ def read_label_file(
 
 def _doubts(label: Label, others: list[Label]) -> Iterator[tuple[str, str]]:
     """Yields kind and message of what cannot be meant of a label, among those before it."""
-    sizes, usual = label.box[3:6], MEDIAN_SIZES_M[label.cls]
-    ratios = [size / median for size, median in zip(sizes, usual, strict=True)]
+    usual = MEDIAN_SIZES_M[label.cls]
+    ratios = [size / x for size, x in zip(label.box[3:6], usual, strict=True)]
     if max(ratios) > MAX_SIZE_RATIO or min(ratios) < 1 / MAX_SIZE_RATIO:
         text = "{} of {:.3g} x {:.3g} x {:.3g} m, expected about {} x {} x {} m"
-        yield "object size", text.format(label.cls, *sizes, *usual)
+        yield "object size", text.format(label.cls, *label.box[3:6], *usual)
     if any(math.dist(label.box[:3], x.box[:3]) < MIN_DISTANCE_M for x in others):
         yield "object twice", f"{label.cls} at the center of another object"
 

@@ -129,16 +129,14 @@ def track_velocities(
         x and y in m/s. NaN for tracks of one frame and above `MAX_SPEED_MPS`.
     """
     order = np.lexsort((frame_idx, track_idx))
-    position, time = position_m[order], time_s[order]
     joined = (np.diff(track_idx[order]) == 0) & (np.diff(frame_idx[order]) == 1)
     rows = np.arange(len(order))
-    first = rows - np.pad(joined, (1, 0))[: len(rows)]
-    last = rows + np.pad(joined, (0, 1))[: len(rows)]
-    period = time[last] - time[first]
+    first = order[rows - np.pad(joined, (1, 0))[: len(rows)]]
+    last = order[rows + np.pad(joined, (0, 1))[: len(rows)]]
+    period = time_s[last] - time_s[first]
     is_known = period > 1e-3
-    velocity = (position[last] - position[first]) / np.where(is_known, period, 1)[
-        :, None
-    ]
+    moved_m = position_m[last] - position_m[first]
+    velocity = moved_m / np.where(is_known, period, 1)[:, None]
     is_known &= np.hypot(*velocity.T) <= MAX_SPEED_MPS
     velocity[~is_known] = 0.0
     values = np.column_stack([velocity, is_known])

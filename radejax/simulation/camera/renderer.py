@@ -111,7 +111,7 @@ def undistort(seen: Pixels, distortion: Float[np.ndarray, "5"]) -> Pixels:
     k1, k2, p1, p2, k3 = distortion
     ideal = seen.copy()
     for _ in range(12):
-        x, y = ideal[..., 0], ideal[..., 1]
+        x, y = np.moveaxis(ideal, -1, 0)
         square = x * x + y * y
         radial = 1.0 + square * (k1 + square * (k2 + square * k3))
         shift_x = 2 * p1 * x * y + p2 * (square + 2 * x * x)

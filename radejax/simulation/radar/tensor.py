@@ -407,8 +407,9 @@ def _beams(
     azimuth_basis: Float[Array, "A N"],
 ) -> Float[jax.Array, "E D 2 A"]:
     """Computes real and imaginary part of every bin from the signals of the arrays."""
-    (num_elevation, m), (_, n) = elevation_basis.shape, azimuth_basis.shape
-    rows = _product(received.reshape(-1, n), azimuth_basis.T)  # [D M 2, A]
+    num_elevation, m = elevation_basis.shape
+    # Products over the azimuth, [D M 2, A], and then over the elevation.
+    rows = _product(received.reshape(-1, azimuth_basis.shape[1]), azimuth_basis.T)
     rows = rows.reshape(received.shape[0] // m, m, -1).transpose(1, 0, 2)
     beams = _product(elevation_basis, rows.reshape(m, -1))
     return beams.reshape(num_elevation, rows.shape[1], 2, -1)

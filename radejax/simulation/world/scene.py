@@ -49,9 +49,9 @@ class Road:
         """
         k = self.curvature_per_m
         heading = k * along_m
-        x, y = along_m, np.zeros_like(along_m)
-        if abs(k) >= 1e-9:
-            x, y = np.sin(heading) / k, (1.0 - np.cos(heading)) / k
+        is_straight = abs(k) < 1e-9
+        x = along_m if is_straight else np.sin(heading) / k
+        y = np.zeros_like(along_m) if is_straight else (1.0 - np.cos(heading)) / k
         return x - left_m * np.sin(heading), y + left_m * np.cos(heading), heading
 
 
