@@ -56,7 +56,8 @@ def test_small_outputs_equal_torchs(variant, radenet_golden, golden):
     with np.load(golden / "models_radenet.npz") as arrays:
         for name in ("heatmap_logits", "box_params"):
             expected = arrays[f"{variant}/{name}"]
-            np.testing.assert_allclose(getattr(maps, name), expected, atol=2e-5)
+            found = getattr(maps, name)[:, :: radenet_golden.ROW_STEP]
+            np.testing.assert_allclose(found, expected, atol=2e-5)
 
 
 def test_small_gradients_equal_torchs(radenet_golden, golden):
