@@ -127,11 +127,11 @@ def detector(kind: str = "radar", *, num_frames: int = 1, **overrides: Any) -> D
     return Detector(saved(kind, data__num_frames=num_frames), **options)
 
 
-def detector_with_output(**options: Any) -> Detector:
+def detector_with_output(*, num_frames: int = 1, **options: Any) -> Detector:
     """A detector with an own output "velocity" of two channels."""
-    made = saved(model__outputs={"velocity": 2})
-    inputs = np.zeros((1, *small_grid().projection_shape), np.float32)
-    variables = jax.jit(made.model.init)(jax.random.key(0), inputs)
+    made = saved(model__outputs={"velocity": 2}, data__num_frames=num_frames)
+    *bins, channels = small_grid().projection_shape
+    variables = drawn(made.model, np.zeros((1, *bins, num_frames * channels)))
     made = dataclasses.replace(made, variables=variables)
     return Detector(made, **{"score_threshold": 0.1, **options})
 

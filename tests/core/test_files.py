@@ -74,18 +74,6 @@ def test_a_folder_is_one_jobs(tmp_path):
         files.claim(path, other, "another job", fix="give --out")
 
 
-def test_a_lock_is_held_once(tmp_path):
-    path = tmp_path / "new" / "lock"
-    with (
-        files.lock(path, "somebody is here"),
-        pytest.raises(UserError, match="somebody is here"),
-        files.lock(path, "somebody is here"),
-    ):
-        pass
-    with files.lock(path, "let go, though the file is there"):
-        pass
-
-
 def test_files_are_found_through_links_once(tmp_path):
     root, disk = tmp_path / "root", tmp_path / "disk"
     for name in ("5/a.npy", "5/b.txt", "5/deep/c.npy"):

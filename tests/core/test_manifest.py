@@ -95,28 +95,6 @@ def test_another_job_in_the_folder_is_an_error(tmp_path):
         Manifest.claim(tmp_path, "boxes", {"step": 1}, ["a", "b"])
 
 
-@pytest.mark.parametrize(
-    ("logged", "there", "message"),
-    [
-        ("a", "a", "an interrupted job, which did not write 1 of 2 files, such as b"),
-        ("ab", "b", "a partial copy, without 1 of 2 files, such as a.json"),
-        (
-            "ab",
-            "abc",
-            "1 files that are not of the job that wrote the others, such as c",
-        ),
-    ],
-)
-def test_missing_and_foreign_files_are_distinguished(tmp_path, logged, there, message):
-    Manifest.claim(tmp_path, "boxes", {}, ["a.json", "b.json"])
-    for name in logged:
-        add(tmp_path, f"{name}.json", [])
-    for name in there:
-        (tmp_path / f"{name}.json").write_text("[]")
-    with pytest.raises(DataError, match=f"{message}.*; fix it"):
-        Manifest.open(tmp_path).check_whole("*.json", "fix it")
-
-
 def test_files_that_are_not_those_of_a_description_are_rejected(tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).write_text(name)

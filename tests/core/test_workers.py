@@ -22,12 +22,15 @@ def is_running(pid):
     return True
 
 
-def test_a_worker_is_started_once_leaves_ctrl_c_alone_and_ends(tmp_path):
+def test_a_worker_is_started_once_survives_ctrl_c_and_errors_and_ends(tmp_path):
     with process_pool(1, os.chdir, tmp_path) as submit:
         pid = submit(os.getpid).result()
         submit(signal.raise_signal, signal.SIGINT).result()
         assert submit(os.getpid).result() == pid != os.getpid()
         assert submit(pathlib.Path.cwd).result() == tmp_path
+        with pytest.raises(DataError, match="line 3"):
+            submit(exec, "raise error", {"error": DataError("line 3")}).result()
+        assert submit(os.getpid).result() == pid
     assert not is_running(pid)
 
 
@@ -84,13 +87,6 @@ def test_a_worker_that_is_killed_or_cannot_start_is_one_line(tmp_path):
     for start_folder in (tmp_path, tmp_path / "nowhere"):
         with pytest.raises(UserError, match=r"process ended early.*fewer workers"):
             dies(start_folder)
-
-
-def test_errors_of_a_worker_are_raised_here(tmp_path):
-    with process_pool(1, os.chdir, tmp_path) as submit:
-        with pytest.raises(DataError, match="line 3"):
-            submit(exec, "raise error", {"error": DataError("line 3")}).result()
-        assert submit(os.getpid).result() != os.getpid()  # it continues to work
 
 
 @pytest.mark.parametrize("first_line", ["end_rerun()", "pass"])

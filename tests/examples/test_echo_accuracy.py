@@ -32,7 +32,7 @@ def test_boxes_are_moved_along_and_across_the_line_of_sight() -> None:
 
 
 def test_scenes_are_measured() -> None:
-    arguments = ["--scenes", "8", "--range-bins", "32", "--cls", "Bicycle"]
+    arguments = ["--scenes", "4", "--range-bins", "32", "--cls", "Bicycle"]
     result = CliRunner().invoke(echo_accuracy.main, arguments)
     assert result.exit_code == 0, result.output
     assert "echo position of class Bicycle, 32 range bins" in result.output

@@ -48,13 +48,13 @@ def test_classes_and_far_detections_are_tracks_of_their_own():
 @pytest.fixture(scope="module")
 def frames(tmp_path_factory) -> KRadar:
     out = tmp_path_factory.mktemp("tracking")
-    return tracking.simulate(SimulationOptions(grid=GRID), out, 2, 20)
+    return tracking.simulate(SimulationOptions(grid=GRID), out, 2, 12)
 
 
 def test_labelled_boxes_as_detections_are_tracked_nearly_perfectly(frames, tmp_path):
     pytest.importorskip("trackeval")
     parts = tracking.consecutive(frames)
-    assert [len(part) for part in parts] == [20, 20]
+    assert [len(part) for part in parts] == [12, 12]
     sequences = {}
     for part in parts:
         truth = tracking.labelled(part)
@@ -93,7 +93,7 @@ def test_scores_of_errors_worked_out_by_hand():
 
 def test_parts_end_at_gaps_and_sequences(frames):
     some = [frame for n, frame in enumerate(frames) if n not in range(3, 9)]
-    assert [len(part) for part in tracking.consecutive(some)] == [3, 11, 20]
+    assert [len(part) for part in tracking.consecutive(some)] == [3, 3, 12]
 
 
 @pytest.mark.slow

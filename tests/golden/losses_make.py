@@ -35,8 +35,8 @@ KEEP = (
     "grad_total_heatmap_channel_stats",
 )
 PAIRS = (
-    *("kind", "pred", "gt", "sigma_pred_f64", "sigma_gt_f64", "inner"),
-    *("inner_sqrt_f64", "gwd_f64", "gwd_grad_f64", "gwd_closed_form_grad_f64"),
+    *("kind", "pred", "gt", "sigma_pred_f64", "sigma_gt_f64"),
+    *("gwd_f64", "gwd_grad_f64", "gwd_closed_form_grad_f64"),
     *("loss_none_f64", "loss_sqrt_f64", "loss_log_f64"),
     *("grad_none_f64", "grad_sqrt_f64", "grad_log_f64"),
 )

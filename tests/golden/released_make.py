@@ -5,8 +5,7 @@
 The reference numbers are outputs of the released RADE-Net and DinoRADE code (commit 9a94d64), of
 Hugging Face transformers 5.23.0 and of `torch.save`, from seeded weights and inputs
 (`seeded_tensor` of `dinorade_make.py`), with PyTorch 2.13.0 on a CPU. The file keeps every fourth
-row, column and token, every `CHANNEL_STEP`-th channel of hidden layers, and the names and shapes
-of the official tensors.
+row, column and token, and the names and shapes of the official tensors.
 """
 
 import json
@@ -15,20 +14,19 @@ import sys
 
 import numpy as np
 
-CHANNEL_STEP = 8
 RADENET = ("default", "base", "no_cbam", "stem", "expand256", "default_heads")
 RADENET += ("default_neck",)
 LISTINGS = (
     *(f"radenet/{variant}" for variant in RADENET),
-    *("dinorade/end_to_end", "dinorade/camneck", "dinorade/fusion", "dinov3/vits16"),
+    *("dinorade/end_to_end", "dinov3/vits16"),
 )
 TORCH_FILES = ("nested_checkpoint", "mixed_dtypes", "channel_attention_legacy")
 
 
-def thinned(file, name, rows="rows", cols="cols", channels=1):
+def thinned(file, name, rows="rows", cols="cols"):
     """A map `[C, rows, cols]` on fewer rows and columns, which are kept as well."""
     return {
-        name: file[name][::channels, ::4, ::4],
+        name: file[name][:, ::4, ::4],
         rows: file[rows][::4],
         cols: file[cols][::4],
     }
@@ -50,20 +48,6 @@ def main(fixtures: pathlib.Path) -> None:
         for name in ("heatmap", "regression"):
             keep(f"radenet/{variant}", thinned(file, name))
             keep(f"radenet/{variant}", {f"{name}_stats": file[f"{name}_stats"]})
-    file = np.load(fixtures / "radenet/default_intermediates.npz")
-    for name in file:
-        if "__" not in name:
-            places = f"{name}__rows", f"{name}__cols"
-            keep("radenet/hidden", thinned(file, name, *places, CHANNEL_STEP))
-    file = np.load(fixtures / "modules/modules.npz")
-    keep("modules", {k: file[k][:, ::CHANNEL_STEP] for k in file if "__" not in k})
-    file = np.load(fixtures / "dinorade/camneck.npz")
-    keep("dinorade/camneck", thinned(file, "output"))
-    file = np.load(fixtures / "dinorade/fusion.npz")
-    keep("dinorade/fusion", thinned(file, "output"))
-    places = "elevation_rows", "elevation_cols"
-    keep("dinorade/fusion", thinned(file, "elevation_weights", *places))
-    keep("dinorade/fusion", {"gate": file["gate"][::8, ::8]})
     file = np.load(fixtures / "dinorade/end_to_end.npz")
     for name in ("heatmap", "regression"):
         keep("dinorade/end_to_end", thinned(file, name))
@@ -73,11 +57,11 @@ def main(fixtures: pathlib.Path) -> None:
     file = np.load(fixtures / "dinov3/vits16.npz")
     config = json.loads((fixtures / "dinov3/vits16_config.json").read_text())
     arrays["dinov3/config"] = np.array(json.dumps(config))
-    for size in ("64x96", "224x224", "720x1280"):
-        names = ("token_index", "last_hidden_state")
-        keep(f"dinov3/{size}", {k: file[f"{size}__{k}"][::4] for k in names})
+    names = ("token_index", "last_hidden_state")
+    keep("dinov3/720x1280", {k: file[f"720x1280__{k}"][::4] for k in names})
     file = np.load(fixtures / "deform_attn/deform_attn.npz")
-    keep("deform_attn", {k: file[k] for k in file if k.startswith("initial_bias")})
+    name = "initial_bias__d128_l1_h4_p8"
+    keep("deform_attn", {name: file[name]})
     for name in TORCH_FILES:
         content = (fixtures / f"torch_files/{name}.pth").read_bytes()
         arrays[f"torch_files/{name}"] = np.frombuffer(content, np.uint8)

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import pathlib
 import shutil
 from types import SimpleNamespace
 
@@ -43,7 +44,7 @@ def _write_projections(folder, names, frames):
 
 
 def test_own_outputs_are_columns_of_the_table(tmp_path, caplog):
-    detector = small.detector_with_output(batch_sizes=(2,))
+    detector = small.detector_with_output()
     frames, keys = small.projections(2), ["7/00000", "7/00001"]
     _write_projections(tmp_path / "data", keys, frames)
     inputs = find_inputs(detector, [tmp_path / "data"])
@@ -62,7 +63,7 @@ def test_own_outputs_are_columns_of_the_table(tmp_path, caplog):
 
 
 def test_every_format_has_the_same_boxes(tmp_path):
-    detector = small.detector(batch_sizes=(2,))
+    detector = small.detector()
     frames, keys = small.projections(3), [f"7/0000{i}" for i in range(3)]
     _write_projections(tmp_path / "data", keys, frames)
     inputs = find_inputs(detector, [tmp_path / "data"])
@@ -113,16 +114,32 @@ def test_every_format_has_the_same_boxes(tmp_path):
         np.testing.assert_array_equal(getattr(found, name), getattr(kitti, name))
 
 
+@pytest.fixture(scope="module")
+def detected(tmp_path_factory):
+    """Detector of three frames, and a folder with `data` and the boxes of every format."""
+    folder = tmp_path_factory.mktemp("detected")
+    keys = [f"7/0000{i}" for i in range(3)]
+    _write_projections(folder / "data", keys, small.projections(3))
+    detector = small.detector()
+    inputs = find_inputs(detector, [folder / "data"])
+    for kind in ("json", "kitti", "csv"):
+        detect_files(detector, inputs, folder / kind, batch_size=2, file_format=kind)
+    return detector, folder
+
+
+def _texts(folder):
+    paths = [path for path in folder.rglob("*[0-9x].*") if "manifest" not in path.name]
+    return {path.relative_to(folder).as_posix(): path.read_text() for path in paths}
+
+
 @pytest.mark.parametrize("file_format", ["json", "kitti", "csv"])
 def test_a_frame_with_a_box_that_is_not_finite_fails(
-    tmp_path, monkeypatch, file_format
+    detected, tmp_path, monkeypatch, file_format
 ):
-    detector = small.detector(score_threshold=0.0)
-    keys = [f"7/0000{i}" for i in range(3)]
-    _write_projections(tmp_path / "data", keys, small.projections(3))
+    detector, folder = detected
+    shutil.copytree(folder / "data", tmp_path / "data")
     inputs = find_inputs(detector, [tmp_path / "data"])
-    out = tmp_path / "out"
-    assert detect_files(detector, inputs, out, file_format=file_format)[1] == {}
+    out = pathlib.Path(shutil.copytree(folder / file_format, tmp_path / "out"))
     earlier = sorted(out.rglob("*"))
     for path in inputs.paths:  # so that they are detected in again
         os.utime(path, ns=(0, 0))
@@ -144,24 +161,6 @@ def test_a_frame_with_a_box_that_is_not_finite_fails(
         with open(out / "boxes.csv", encoding="utf-8") as file:
             found = {row["frame"] for row in csv.DictReader(file)}
         assert found == {"7/00000", "7/00002"}
-
-
-@pytest.fixture(scope="module")
-def detected(tmp_path_factory):
-    """Detector of three frames, and a folder with `data` and the boxes of every format."""
-    folder = tmp_path_factory.mktemp("detected")
-    keys = [f"7/0000{i}" for i in range(3)]
-    _write_projections(folder / "data", keys, small.projections(3))
-    detector = small.detector(batch_sizes=(2,))
-    inputs = find_inputs(detector, [folder / "data"])
-    for kind in ("json", "kitti", "csv"):
-        detect_files(detector, inputs, folder / kind, batch_size=2, file_format=kind)
-    return detector, folder
-
-
-def _texts(folder):
-    paths = [path for path in folder.rglob("*[0-9x].*") if "manifest" not in path.name]
-    return {path.relative_to(folder).as_posix(): path.read_text() for path in paths}
 
 
 @pytest.mark.parametrize(
@@ -193,7 +192,7 @@ def test_a_file_that_cannot_be_read_fails_alone_and_a_second_call_continues(
 
 
 def test_an_image_that_cannot_be_read_fails_alone(tmp_path):
-    detector = small.detector("camera", batch_sizes=(2,))
+    detector = small.detector("camera")
     images = [tmp_path / f"{i}.png" for i in range(3)]
     for path, image in zip(images, small.images(3), strict=True):
         Image.fromarray(image).save(path)
@@ -319,7 +318,7 @@ def test_frames_that_failed_are_left_out_and_counted(detected, tmp_path, kind):
 
 def test_preceding_frames_of_files_are_of_their_sequence(tmp_path):
     """Frames 7, 8 and 10 of a sequence, and 11 of the next one."""
-    detector = small.detector(num_frames=2, batch_sizes=(2,))
+    detector = small.detector(num_frames=2)
     frames = small.projections(4)
     _write_projections(
         tmp_path / "data", ("1/00007", "1/00008", "1/00010", "2/00011"), frames
@@ -337,7 +336,7 @@ def test_preceding_frames_of_files_are_of_their_sequence(tmp_path):
 
 
 def test_a_frame_after_one_that_cannot_be_read_has_no_preceding_one(tmp_path):
-    detector = small.detector(num_frames=2, batch_sizes=(2,))
+    detector = small.detector(num_frames=2)
     frames = small.projections(4)
     keys = ("1/00007", "1/00008", "1/00009", "1/00010")
     _write_projections(tmp_path / "data", keys, frames)

@@ -135,8 +135,8 @@ def test_a_fresh_process_without_radejax_finds_the_same_boxes(tmp_path):
     _check(found, "3", again(projection))
 
 
-def test_a_program_of_two_frames_takes_the_channels_of_both(tmp_path):
-    detector = small.detector(num_frames=2)
+def test_a_program_of_two_frames_and_an_own_output(tmp_path):
+    detector = small.detector_with_output(num_frames=2)
     export.export(detector, tmp_path, platforms=("cpu",))
     rows = json.loads((tmp_path / "inputs.json").read_text())
     assert rows[-4]["shape"] == [None, 16, 14, 10]
@@ -155,20 +155,11 @@ def test_a_program_of_two_frames_takes_the_channels_of_both(tmp_path):
     again = Detector.from_workdir(tmp_path)
     assert again.num_frames == 2
     _check(found, "1", again(frames))
-
-
-def test_own_outputs_are_results_of_a_program(tmp_path):
-    detector = small.detector_with_output(batch_sizes=(2,))
-    export.export(detector, tmp_path, platforms=("cpu",), batch_size=2)
     rows = json.loads((tmp_path / "outputs.json").read_text())
     (row,) = (row for row in rows if row["name"] == "velocity")
-    assert row["shape"] == [2, 100, 2]
+    assert row["shape"] == [None, 100, 2]
     assert row["unit"] == "output of the model's own"
-    projection = small.projections(2)
-    found = exported_loader.load(tmp_path)(projection)
-    expected = detector(projection).outputs["velocity"]
-    np.testing.assert_allclose(found["velocity"], expected, atol=1e-5)
-    assert np.abs(expected).max() > 0
+    assert np.abs(found["velocity_1"]).max() > 0
 
 
 @pytest.mark.slow

@@ -230,16 +230,6 @@ def test_an_exported_camera_model_is_without_dinov3(tmp_path):
         save_model(small.saved("camera", model__image__freeze=False), tmp_path)
 
 
-def test_bfloat16_computes_close_to_float32():
-    full, half = small.detector(), small.detector(dtype="bfloat16")
-    assert half.model.options.dtype == "bfloat16"
-    inputs = small.projections(1)
-    a, b = (np.asarray(d(inputs).scores[0, 0]) for d in (full, half))
-    assert a != b
-    assert a == pytest.approx(b, abs=0.02)
-    assert jax.tree.leaves(half.variables)[0].dtype == np.float32
-
-
 def test_a_flipped_bit_of_the_weights_is_found(tmp_path):
     programs = {"detector.stablehlo": b"a program"}
     save_model(small.saved(), tmp_path, programs=programs)

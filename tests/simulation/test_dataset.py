@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import multiprocessing
 import os
 import shutil
 import subprocess
@@ -233,27 +232,6 @@ class TestWrongUse:
         ):
             with pytest.raises(UserError, match=message):
                 simulate_dataset(small_config(seed=5), root, progress=False)
-
-    def test_a_killed_worker_raises_a_user_error(self, tmp_path, monkeypatch):
-        root, write = tmp_path / "data", dataset.Writer.write_frame
-
-        def write_and_kill(*frame):
-            write(*frame)
-            for worker in multiprocessing.active_children():
-                worker.kill()
-
-        monkeypatch.setattr(dataset.Writer, "write_frame", write_and_kill)
-        with pytest.raises(UserError, match="a worker process ended early"):
-            simulate_dataset(small_config(), root, num_workers=1, progress=False)
-        assert 1 <= len(list(root.rglob("info_label_v2_1/*.txt"))) < 9
-
-    def test_full_disk(self, tmp_path, monkeypatch):
-        def full(*args, **kwargs):
-            raise OSError(28, "No space left on device")
-
-        monkeypatch.setattr(os, "replace", full)
-        with pytest.raises(UserError, match="no space left"):
-            simulate_dataset(small_config(), tmp_path / "full", progress=False)
 
 
 def test_expected_size_is_that_of_the_files(tree, tmp_path):

@@ -1,13 +1,11 @@
 """Training as released: our optimizer, schedule and step beside the official code's own.
 
-`../shared/fixtures/trajectory` holds twelve optimizer steps of the released RADE-Net on
-six recipe frames, and four of DinoRADE; its README, section 14. Limits are a few times
-what another order of float32 sums alone does to the authors' code there.
+`tests/golden/trajectory.npz` holds twelve optimizer steps of the released RADE-Net on six
+frames of random objects, and four of DinoRADE. Limits are a few times what another order of
+float32 sums alone does to the authors' code there.
 """
 
 import json
-import pathlib
-import types
 import zlib
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -17,13 +15,13 @@ import numpy as np
 import pytest
 
 from radejax import models
-from radejax.config import Config, load_config, load_module
+from radejax.config import Config, load_config
 from radejax.core import devices
-from radejax.core.structures import CLASSES, Batch, DetectionMaps
-from radejax.geometry.camera import CameraCalibration, stack_cameras
+from radejax.core.structures import Batch, DetectionMaps
+from radejax.geometry.boxes import boxes8_from_7
+from radejax.geometry.camera import stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.saved import load_torch
-from radejax.models.lifting import OFFICIAL_OFFSET_M
 from radejax.models.vit import ViT
 from radejax.training.step import (
     TrainState,
@@ -34,6 +32,8 @@ from radejax.training.step import (
 )
 from radejax.weights import dinov3_hf, radenet_torch
 
+from .. import small_models
+
 SEED = 1234
 LOSSES = ("focal", "gwd", "smooth_l1", "grad_norm")
 STEPS_PER_EPOCH = 3
@@ -42,23 +42,47 @@ Measured = dict[str, np.ndarray]
 
 
 @pytest.fixture(scope="module")
-def frames(shared):
-    """The six frames, float32 as the fixture's network sees them."""
-    recipe = load_module(shared / "fixtures" / "trajectory_recipe.py")
-    objects, cubes = recipe.frames(SEED), recipe.cubes(SEED)
-    boxes = np.zeros((len(objects), 5, 8), np.float32)
-    classes = np.full(boxes.shape[:2], -1, np.int32)
-    for i, frame in enumerate(objects):
-        for j, o in enumerate(frame):
-            yaw = (np.sin(o["yaw"]), np.cos(o["yaw"]))
-            boxes[i, j] = [*(o[name] for name in "xyzlwh"), *yaw]
-            classes[i, j] = CLASSES.index(o["class"])
+def file(golden) -> Measured:
+    return dict(np.load(golden / "trajectory.npz"))
+
+
+def of_training(file: Measured, kind: str) -> Measured:
+    """The arrays of one of the two trainings."""
+    prefix = f"{kind}/"
+    return {k.removeprefix(prefix): v for k, v in file.items() if k.startswith(prefix)}
+
+
+def cube_of(frame: int, boxes: np.ndarray, classes: np.ndarray) -> np.ndarray:
+    """The cube `[101, 256, 107]` in which each object is a spot with channels of its class."""
+    rng = np.random.default_rng([SEED, 950 + frame])
+    cube = 0.45 + 0.1 * rng.random((101, 256, 107), dtype=np.float32)
+    rows, cols, channel = np.arange(256)[:, None], np.arange(107)[None], np.arange(101)
+    for (x, y, z, *_), cls in zip(boxes, classes, strict=True):
+        row = np.hypot(x, y) * 255 / 118
+        column = np.rad2deg(-np.arctan2(y, x)) + 53
+        spot = (rows - row) ** 2 / (2 * 2.0**2) + (cols - column) ** 2 / (2 * 1.5**2)
+        doppler = (channel - (6 + 12 * cls)) ** 2 / (2 * (2.0 + cls) ** 2)
+        elevation = (channel - 82 - 4 * z) ** 2 / (2 * 3.0**2)
+        level = np.where(channel < 64, np.exp(-doppler), np.exp(-elevation))
+        cube += (0.35 * level[:, None, None] * np.exp(-spot)[None]).astype(np.float32)
+    return cube
+
+
+@pytest.fixture(scope="module")
+def frames(file) -> Batch:
+    """The six frames, float32 as the authors' network sees them."""
+    boxes, classes = file["boxes"], file["classes"].astype(np.int32)
+    cubes = np.stack(
+        [cube_of(i, boxes[i][x >= 0], x[x >= 0]) for i, x in enumerate(classes)]
+    )
+    assert zlib.crc32(cubes.tobytes()) == file["radenet/cube_crc32"]
     return Batch(
         projection=np.ascontiguousarray(np.moveaxis(cubes, 1, -1)),
-        boxes=boxes,
+        boxes=np.asarray(boxes8_from_7(np.nan_to_num(boxes)), np.float32)
+        * (classes >= 0)[..., None],
         classes=classes,
         is_valid=classes >= 0,
-        frame=np.arange(len(objects), dtype=np.int32),
+        frame=np.arange(len(boxes), dtype=np.int32),
     )
 
 
@@ -139,7 +163,7 @@ def check_stats(
 
 @pytest.mark.slow  # twelve steps of the full network: 8 processor minutes, 8 GiB
 @pytest.mark.timeout(3000)
-def test_radenet_trains_as_released(shared, frames, make):
+def test_radenet_trains_as_released(file, frames, make):
     config = load_config("radenet:official")
     model = models.build(config.model)
     tensors = {
@@ -149,19 +173,13 @@ def test_radenet_trains_as_released(shared, frames, make):
     variables = load_torch(tensors).variables
     state, measured = train(config, model, variables, frames, 12)
     maps = jax.jit(model.apply)(state.eval_variables, frames.projection[:1])
-    with np.load(shared / "fixtures/trajectory/radenet_official.npz") as fixture:
-        # Seen: 3e-7, up to 2e-4 in steps 2 to 5, 4e-3 after.
-        check_steps(measured, fixture, np.array([2e-6, *[6e-4] * 4, *[8e-3] * 7]))
-        check_maps(maps, fixture, heatmap=8e-4, regression=1.2e-2)
-        trained = radenet_torch.save(model, state.eval_variables)
-        assert set(trained) == set(map(str, fixture["names"]))
-        check_stats(trained, fixture, (2e-5, 2e-5, 1.5e-4))
-
-
-def seeded(shared: pathlib.Path, make: types.ModuleType, name: str) -> dict[str, Any]:
-    """Tensors that a fixture lists."""
-    path = shared / "fixtures" / f"{name}_params.json"
-    return make.seeded_state_dict(json.loads(path.read_text())["tensors"])
+    fixture = of_training(file, "radenet")
+    # Seen: 3e-7, up to 2e-4 in steps 2 to 5, 4e-3 after.
+    check_steps(measured, fixture, np.array([2e-6, *[6e-4] * 4, *[8e-3] * 7]))
+    check_maps(maps, fixture, heatmap=8e-4, regression=1.2e-2)
+    trained = radenet_torch.save(model, state.eval_variables)
+    assert set(trained) == set(map(str, fixture["names"]))
+    check_stats(trained, fixture, (2e-5, 2e-5, 1.5e-4))
 
 
 def by_torch_name(
@@ -213,7 +231,7 @@ NO_GRADIENT = [f"image_neck.{n}.0.bias" for n in ("fpn_layer1", "fpn_layer2", "r
 
 @pytest.mark.slow  # six ViT-S/16 and four steps of all: 6 processor minutes, 8 GiB
 @pytest.mark.timeout(3000)
-def test_dinorade_trains_as_released(shared, frames, make):
+def test_dinorade_trains_as_released(file, frames, make, released):
     config = load_config("dinorade:official")
     # The fixture's settings where they are not the release's.
     config = config.replace(
@@ -221,18 +239,18 @@ def test_dinorade_trains_as_released(shared, frames, make):
         train={"final_learning_rate": config.train.learning_rate},
     )
     model = models.build(config.model)
-    tensors = seeded(shared, make, "dinorade/end_to_end")
+    tensors, of_backbone = (
+        {name: make.seeded_tensor(name, tuple(shape)) for name, shape in listed.items()}
+        for listed in (
+            json.loads(str(released(group)["tensors"]))
+            for group in ("dinorade/end_to_end", "dinov3/vits16")
+        )
+    )
     variables = load_torch(tensors).variables
-    backbone = dinov3_hf.to_params(
-        ViT(model.options.image), seeded(shared, make, "dinov3/vits16")
-    )
+    backbone = dinov3_hf.to_params(ViT(model.options.image), of_backbone)
     variables["params"]["image_backbone"] = backbone
-    calibration = CameraCalibration.from_kradar(
-        shared / "data/kradar/calib/common/cam_front0.yml",
-        radar_from_lidar_m=OFFICIAL_OFFSET_M,
-    )
-    with np.load(shared / "fixtures/trajectory/dinorade_official.npz") as file:
-        fixture = dict(file)
+    calibration = small_models.official_calibration()
+    fixture = of_training(file, "dinorade")
     batch = frames.replace(
         image=images(fixture, model, variables),
         camera=stack_cameras([calibration.camera("pinhole")] * len(frames.frame)),

@@ -48,31 +48,42 @@ def load_variant(radenet_golden, variant):
     return model, *load(state, **overrides)
 
 
-@pytest.mark.parametrize("variant", ["model", "base", "stem", "expand", "paper"])
+OUTPUTS = ("heatmap_logits", "box_params")
+
+
+def check_outputs(outputs, variant, radenet_golden, arrays):
+    for name, output in zip(OUTPUTS, outputs, strict=True):
+        found = output[:, :: radenet_golden.ROW_STEP]
+        np.testing.assert_allclose(found, arrays[f"{variant}/{name}"], atol=2e-5)
+
+
+@pytest.mark.parametrize("variant", ["base", "stem", "expand", "paper"])
 def test_small_outputs_equal_torchs(variant, radenet_golden, golden):
     expected_model, model, variables = load_variant(radenet_golden, variant)
     assert model == expected_model  # worked out from names and shapes
     maps = jax.jit(model.apply)(variables, radenet_golden.small_input())
     with np.load(golden / "models_radenet.npz") as arrays:
-        for name in ("heatmap_logits", "box_params"):
-            expected = arrays[f"{variant}/{name}"]
-            np.testing.assert_allclose(getattr(maps, name), expected, atol=2e-5)
+        outputs = maps.heatmap_logits, maps.box_params
+        check_outputs(outputs, variant, radenet_golden, arrays)
 
 
-def test_small_gradients_equal_torchs(radenet_golden, golden):
-    _, model, variables = load_variant(radenet_golden, "model")
+def test_small_outputs_and_gradients_equal_torchs(radenet_golden, golden):
+    expected_model, model, variables = load_variant(radenet_golden, "model")
+    assert model == expected_model
     x = radenet_golden.small_input()
 
     def loss(variables):
         maps = model.apply(variables, x, train=True)
         maps = (maps.heatmap_logits, maps.box_params)
         weights = radenet_golden.cotangents([m.shape for m in maps])
-        return sum((m * w).sum() for m, w in zip(maps, weights, strict=True))
+        total = sum((m * w).sum() for m, w in zip(maps, weights, strict=True))
+        return total, maps
 
-    gradient = jax.jit(jax.grad(loss))(variables)
+    gradient, outputs = jax.jit(jax.grad(loss, has_aux=True))(variables)
     # Written like a checkpoint, a gradient has torch's names and layout.
     gradient = radenet_torch.save(model, gradient)
     with np.load(golden / "models_radenet.npz") as arrays:
+        check_outputs(outputs, "model", radenet_golden, arrays)
         for name in radenet_golden.GRADIENTS:
             expected = arrays[f"model/grad/{name}"]
             tolerance = 1e-4 * np.abs(expected).max()
