@@ -177,10 +177,10 @@ def radenet(net: Network) -> Sheet:
         lines=(
             f"backbone {net.count('backbone')}, neck {net.count('neck')}, "
             f"heads {net.count('heads')}",
-            "",
             "Shapes: range × azimuth × channels, of configs/radenet.py.",
-            "Encoder, bottleneck, decoder: two 3 × 3 convolutions with group",
-            "normalization and SiLU, and a residual.",
+            "Encoders and decoders have one block, the bottleneck has two: two 3 × 3",
+            "convolutions with group normalization and SiLU, and a residual. Another",
+            "3 × 3 convolution precedes encoder 1.",
             "Max pooling 2 × 2 between encoders, upsampling 2 × 2 before decoders.",
         ),
     )  # fmt: skip
@@ -308,7 +308,7 @@ def dinorade(net: Network) -> Sheet:
     )
     gate = sheet.block(
         right, top, title="Gate", color=ATTENTION, height=82,
-        lines=("weight of the camera", "per bin and channel", net.given("image_fusion")),
+        lines=("Γ: weight of the radar", "per bin and channel", net.given("image_fusion")),
     )  # fmt: skip
     sheet.arrow(radar_neck.right, gate.left)
     between = (third + right) / 2
