@@ -177,6 +177,7 @@ def radenet(net: Network) -> Sheet:
         lines=(
             f"backbone {net.count('backbone')}, neck {net.count('neck')}, "
             f"heads {net.count('heads')}",
+            "",
             "Shapes: range × azimuth × channels, of configs/radenet.py.",
             "Encoders and decoders have one block, the bottleneck has two: two 3 × 3",
             "convolutions with group normalization and SiLU, and a residual. Another",

@@ -164,7 +164,11 @@ def evaluate(
 @click.command(cls=entry.Command)
 @click.argument("run_folder", metavar="RUN", type=entry.EXISTING)
 @entry.step
-@click.option("--split", default="validation", help="validation, or a split file.")
+@click.option(
+    "--split",
+    default="validation",
+    help="validation, a split file, or, of other data, test or all.",
+)
 @several("--data", help="Roots of other labelled sequences. Default: those of the run.")
 @entry.image_backbone
 @entry.json_option
