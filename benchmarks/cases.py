@@ -148,7 +148,7 @@ def load(machine):
         columns = {}
         for name, dtype in (("radejax", "float16"), ("radejax, uint8", "uint8")):
             source = stack.enter_context(inputs.folder_of_records(32, GRID, dtype))
-            table = make_table(source, inputs.labelled(source), max_objects=32)
+            table = make_table(source, inputs.labeled(source), max_objects=32)
             batches = make_loader(table, LoaderOptions(size))
             take = functools.partial(itertools.islice, batches, count // size)
             # As in training, earlier batches are released.
@@ -165,7 +165,7 @@ def load(machine):
         inputs.folder_of_records(32, GRID, "float16") as source,
         inputs.front_images(32) as images,
     ):
-        frames = inputs.labelled(source)
+        frames = inputs.labeled(source)
         for name, given, count in (("radar", None, 128), ("camera", images, 32)):
             table = make_table(source, frames, max_objects=32, images=given)
             for num_threads in inputs.thread_counts():

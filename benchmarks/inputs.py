@@ -145,7 +145,7 @@ def thread_counts():
     return sorted({1, 2, usable_cpus()})
 
 
-def labelled(records):
+def labeled(records):
     """Returns the frames of the records, with five boxes each."""
     box = np.array([[20.0, 1, 0, 4, 2, 1.5, 0.3]])
     return [

@@ -219,7 +219,7 @@ def feeding(machine):
     dtype, size = ("float32", 1) if machine["platform"] == "cpu" else ("bfloat16", 8)
     config, model, precision = network("radenet.py", dtype)
     with inputs.folder_of_records(32, GRID, "float16") as records:
-        table = make_table(records, inputs.labelled(records), max_objects=8)
+        table = make_table(records, inputs.labeled(records), max_objects=8)
         first = next(make_loader(table, LoaderOptions(size)))
         variables = random_variables(model, np.asarray(first.projection))
         step, cost = step_of(config, model, variables, first, precision)

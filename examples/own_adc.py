@@ -23,7 +23,7 @@ from radejax.config import Config
 from radejax.core.errors import DataError, require
 from radejax.core.structures import CLASSES as SIMULATED
 from radejax.data.adc import LIGHT_MPS, FmcwRadar, adc_to_power, read_ti_bin
-from radejax.data.dataset import LabelledFrame, LabelledFrames
+from radejax.data.dataset import LabeledFrame, LabeledFrames
 from radejax.data.projection import LOG_SCALE_DB, find_problem, project_tensor
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.config import SimulationOptions
@@ -50,7 +50,7 @@ GRID = RADAR.make_grid()
 # Reader ------------------------------------------------------------------------------
 
 
-class AdcFrame(LabelledFrame):
+class AdcFrame(LabeledFrame):
     """One frame of a `.bin` file; its name is its number in the file."""
 
     def read_projection(self, grid: RadarGrid) -> np.ndarray:
@@ -64,7 +64,7 @@ class AdcFrame(LabelledFrame):
         return projection
 
 
-class AdcRecordings(LabelledFrames):
+class AdcRecordings(LabeledFrames):
     """The frames of a folder; every fifth drive is in the test split."""
 
     @classmethod

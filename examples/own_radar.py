@@ -23,7 +23,7 @@ from radejax.cli import entry
 from radejax.config import Config
 from radejax.core.archives import read_npy
 from radejax.core.errors import DataError, require
-from radejax.data.dataset import LabelledFrame, LabelledFrames
+from radejax.data.dataset import LabeledFrame, LabeledFrames
 from radejax.data.projection import linear_power, to_log_scale
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.options import RadeNetOptions
@@ -47,7 +47,7 @@ MOUNTING_YAW_RAD = 0.1
 # Reader ------------------------------------------------------------------------------
 
 
-class OwnFrame(LabelledFrame):
+class OwnFrame(LabeledFrame):
     """One file of linear power `[R, A, D]`."""
 
     def read_projection(self, grid: RadarGrid) -> np.ndarray:
@@ -56,7 +56,7 @@ class OwnFrame(LabelledFrame):
         return to_log_scale(power)
 
 
-class OwnRadar(LabelledFrames):
+class OwnRadar(LabeledFrames):
     """The frames of a folder; every fifth drive is in the test split."""
 
     @classmethod

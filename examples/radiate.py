@@ -24,7 +24,7 @@ from radejax.cli import entry
 from radejax.config import Config
 from radejax.core.archives import wrap_read_errors
 from radejax.core.errors import DataError, require
-from radejax.data.dataset import LabelledFrame, LabelledFrames
+from radejax.data.dataset import LabeledFrame, LabeledFrames
 from radejax.data.projection import linear_power, to_log_scale
 from radejax.geometry.camera import LOOKING_AHEAD, CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
@@ -53,7 +53,7 @@ GRID = RadarGrid(
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class RadiateFrame(LabelledFrame):
+class RadiateFrame(LabeledFrame):
     """One turn of the antenna."""
 
     split: str
@@ -86,7 +86,7 @@ class RadiateFrame(LabelledFrame):
             )
 
 
-class Radiate(LabelledFrames):
+class Radiate(LabeledFrames):
     """All sequences of a folder. The last fifth of the frames of each is in the test split."""
 
     license = "MIT for the sample in the SDK; otherwise see the terms of RADIATE"

@@ -7,7 +7,7 @@
 
 By default, sequences of the radar that the model was trained for are simulated at 10 frames per
 second, and the model is the one that `radejax demo` uses. The tracks live in the radar frame, so
-their velocities are relative to the radar, like the column "velocity_mps" of labelled frames. They
+their velocities are relative to the radar, like the column "velocity_mps" of labeled frames. They
 are compared with the track ids of the labels by the library TrackEval. OUT contains the table and
 a figure of the tracks.
 """
@@ -46,7 +46,7 @@ MAX_GAP_S = 0.5
 
 
 class Objects(NamedTuple):
-    """Objects of one frame: labelled ones, detections or tracks.
+    """Objects of one frame: labeled ones, detections or tracks.
 
     Attributes:
         cls: Class names.
@@ -66,7 +66,7 @@ class Objects(NamedTuple):
 
 
 Sides = tuple[list[Objects], list[Objects]]
-"""Labelled objects and tracks in every frame of a sequence."""
+"""Labeled objects and tracks in every frame of a sequence."""
 
 
 # Tracking -------------------------------------------------------------------------------
@@ -211,8 +211,8 @@ def consecutive(frames: Iterable[Frame]) -> list[list[Frame]]:
     return parts
 
 
-def labelled(frames: Sequence[Frame]) -> list[Objects]:
-    """Returns the labelled objects of every frame of a sequence."""
+def labeled(frames: Sequence[Frame]) -> list[Objects]:
+    """Returns the labeled objects of every frame of a sequence."""
     numbers: dict[tuple[str, int], int] = {}
     found = []
     for frame in frames:
@@ -319,7 +319,7 @@ def score(sequences: Iterable[Sides]) -> Table:
 
 
 def draw(path: pathlib.Path, sequences: Mapping[str, Sides]) -> None:
-    """Draws the paths of labelled objects and tracks in up to 8 sequences, by title."""
+    """Draws the paths of labeled objects and tracks in up to 8 sequences, by title."""
     sequences = dict(itertools.islice(sequences.items(), 8))
     figure = new_figure(2.6 * len(sequences) + 0.6, 5.2, layout="constrained")
     panels = figure.subplots(1, len(sequences), squeeze=False, sharex=True, sharey=True)
@@ -381,7 +381,7 @@ def main(
             found = detected(detector, part, frames.grid)
             clock_s = [frame.header.timestamp_s for frame in part]
             title = f"{part[0].key}\n{part[0].environment}, {part[0].weather}"
-            sequences[title] = labelled(part), track_frames(found, clock_s)
+            sequences[title] = labeled(part), track_frames(found, clock_s)
         table = score(sequences.values()).render(
             "markdown", is_simulated=frames.is_simulated
         )

@@ -157,7 +157,7 @@ def images(count: int) -> np.ndarray:
     return rng.integers(0, 256, (count, *IMAGE_SIZE, 3), dtype=np.uint8)
 
 
-def labelled_batch(projection: np.ndarray, image: np.ndarray | None = None) -> Batch:
+def labeled_batch(projection: np.ndarray, image: np.ndarray | None = None) -> Batch:
     """Frames with two sedans each, and their images from the small camera."""
     count, rng = len(projection), np.random.default_rng(0)
     boxes = np.zeros((count, 3, 8), np.float32)

@@ -42,7 +42,7 @@ def _case(kind: str) -> tuple[Any, Batch, Any, Callable[..., Any]]:
     config = small_models.camera_config() if has_camera else small_models.radar_config()
     model = models.build(config.model.with_fields(KINDS[kind]))
     images = small_models.images(BATCH_SIZE) if has_camera else None
-    batch = small_models.labelled_batch(small_models.projections(BATCH_SIZE), images)
+    batch = small_models.labeled_batch(small_models.projections(BATCH_SIZE), images)
     inputs = jax.tree.map(lambda x: x[:1], batch).model_inputs()
     variables = small_models.drawn(model, *inputs)
     # Gradient descent, because the optimizer's work on each device is that of one device.

@@ -22,7 +22,7 @@ from radejax.cli.main import main
 from radejax.config import Config
 from radejax.core.errors import UserError
 from radejax.data.check import check_frames
-from radejax.data.dataset import LabelledFrames, find_reader
+from radejax.data.dataset import LabeledFrames, find_reader
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.check import check_dataset
 from radejax.data.options import DataOptions
@@ -136,7 +136,7 @@ def _write_toy(root: pathlib.Path) -> pathlib.Path:
     return root
 
 
-def _read_toy(root: pathlib.Path) -> LabelledFrames:
+def _read_toy(root: pathlib.Path) -> LabeledFrames:
     options = DataOptions(format="toy:Toy", roots=(str(root),))
     return find_reader(options.format).from_options(options, ("Sedan",))
 
@@ -386,7 +386,7 @@ def test_written_folders_are_read(
         ("model.exponent", "2", "exponent is '2', expected a number"),
         ("loss.own_terms", (), "for some of focal, gwd, smooth_l1, and"),
         ("evaluation.protocols", ("parts:PowerNet",), "the name of a Protocol"),
-        ("data.format", "parts:PowerNet", "expected the name of a LabelledFrames"),
+        ("data.format", "parts:PowerNet", "expected the name of a LabeledFrames"),
         ("data.format", "json:Reader", "no attribute 'Reader'"),
         ("data.format", "nuscenes", "'nuscenes', expected 'kradar' or module:Object"),
     ],

@@ -5,13 +5,13 @@ import pathlib
 import numpy as np
 
 from radejax.core.files import read_json
-from radejax.data.dataset import LabelledFrame, LabelledFrames
+from radejax.data.dataset import LabeledFrame, LabeledFrames
 from radejax.data.projection import project_tensor
 from radejax.geometry.camera import CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
 
 
-class ToyFrame(LabelledFrame):
+class ToyFrame(LabeledFrame):
     """One `DRIVE/NUMBER.npz`, and `NUMBER.png` beside it where there was a camera."""
 
     def read_projection(self, grid):
@@ -24,7 +24,7 @@ class ToyFrame(LabelledFrame):
         return CameraCalibration.from_angles(**fields, radar_from_lidar_m=shift)
 
 
-class Toy(LabelledFrames):
+class Toy(LabeledFrames):
     """Drives of `ROOT/1`, `ROOT/2`, ...; the last one is the test split."""
 
     @classmethod

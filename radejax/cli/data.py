@@ -18,7 +18,7 @@ from radejax.core.files import read_object
 if TYPE_CHECKING:
     import numpy as np
 
-    from radejax.data.dataset import LabelledFrame
+    from radejax.data.dataset import LabeledFrame
     from radejax.data.records import PreprocessReport
 
 _rate = click.option(
@@ -50,7 +50,7 @@ def _echo_report(report: PreprocessReport) -> None:
     "--frames",
     "frames_per_sequence",
     type=click.IntRange(0),
-    help="Frames per sequence, of both splits with --scenes; 0 = all labelled frames.",
+    help="Frames per sequence, of both splits with --scenes; 0 = all labeled frames.",
 )
 @click.option(
     "--full-size", is_flag=True, help="K-Radar's own grid and images of 2560 x 720."
@@ -124,7 +124,7 @@ def data() -> None:
 
 @data.command(cls=entry.Command)
 @entry.roots
-@entry.labelled_frames
+@entry.labeled_frames
 @entry.camera_calibration
 @click.option(
     "--deep", is_flag=True, help="Read every radar tensor and image completely."
@@ -171,7 +171,7 @@ def _shard(text: str) -> tuple[int, int]:
 @click.command(cls=entry.Command)
 @entry.roots
 @entry.out_folder("Folder of the records.")
-@entry.labelled_frames
+@entry.labeled_frames
 @click.option(
     "--dtype",
     type=click.Choice(["float16", "uint8", "float32"]),
@@ -288,7 +288,7 @@ def points(
     from radejax.data.kradar.radar_files import find_frames, sequence_folder
     from radejax.data.records import PreprocessReport
 
-    sources: dict[pathlib.Path, pathlib.Path | LabelledFrame] = {}
+    sources: dict[pathlib.Path, pathlib.Path | LabeledFrame] = {}
     read: Callable[[Any], np.ndarray]
     if config is not None:
         frames = entry.read_frames(

@@ -27,7 +27,7 @@ from radejax.core.files import is_no_space
 
 if TYPE_CHECKING:
     from radejax.config import Config
-    from radejax.data.dataset import LabelledFrame, LabelledFrames
+    from radejax.data.dataset import LabeledFrame, LabeledFrames
 
 Function = Callable[..., object]
 Decorator = Callable[[Function], Function]
@@ -324,7 +324,7 @@ own_reader = click.option(
     metavar="CONFIG",
     help="Config as of `radejax train` that names a reader of other data than K-Radar.",
 )
-labelled_frames = together(
+labeled_frames = together(
     own_reader,
     click.option(
         "--label-version",
@@ -344,7 +344,7 @@ def read_frames(
     weather: Sequence[str] | None = None,
     any_visibility: bool = False,
     **paths: str | None,
-) -> LabelledFrames[LabelledFrame]:
+) -> LabeledFrames[LabeledFrame]:
     """Reads the frames of folders by the reader of a config, that of K-Radar without one.
 
     Args:

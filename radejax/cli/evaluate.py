@@ -169,7 +169,7 @@ def evaluate(
     default="validation",
     help="validation, a split file, or, of other data, test or all.",
 )
-@several("--data", help="Roots of other labelled sequences. Default: those of the run.")
+@several("--data", help="Roots of other labeled sequences. Default: those of the run.")
 @entry.image_backbone
 @entry.json_option
 def calibrate(run_folder: str, as_json: bool, **options: object) -> None:
@@ -177,7 +177,7 @@ def calibrate(run_folder: str, as_json: bool, **options: object) -> None:
 
     `Detector`, `radejax detect` and exported programs then give the probability of every
     box. Scores and APs do not change. Without a validation split (config.data.validation),
-    give other labelled sequences.
+    give other labeled sequences.
 
     Example: radejax calibrate runs/quickstart
     """

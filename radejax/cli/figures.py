@@ -17,7 +17,7 @@ from radejax.core.errors import UserError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from radejax.data.dataset import LabelledFrame, LabelledFrames
+    from radejax.data.dataset import LabeledFrame, LabeledFrames
 
 MODEL = pathlib.Path(__file__).with_name("demo_model")
 """Model of the quickstart with seed 0; docs/detector.md lists the commands that made it."""
@@ -35,7 +35,7 @@ _detections = entry.together(
 @click.command(cls=entry.Command)
 @click.argument("name", metavar="[FRAME]", default="")
 @entry.several("--data", "roots", required=True, help="Roots of K-Radar.")
-@entry.labelled_frames
+@entry.labeled_frames
 @entry.camera_calibration
 @entry.out_file("overlay.png", "Image file, or .gif for several frames.")
 @click.option(
@@ -116,7 +116,7 @@ def overlay(
     click.echo(f"drew {out}{'' if slices else _undrawn(found)}")
 
 
-def _undrawn(frames: Sequence[LabelledFrame]) -> str:
+def _undrawn(frames: Sequence[LabeledFrame]) -> str:
     """Says for how many frames no radar data, or no boxes on an image, are drawn, and why."""
     radar = sum(not (x.radar_path and x.radar_path.exists()) for x in frames)
     shown = [frame for frame in frames if frame.camera_path is not None]
@@ -135,8 +135,8 @@ def _undrawn(frames: Sequence[LabelledFrame]) -> str:
 
 
 def _draw(
-    frames: LabelledFrames[LabelledFrame],
-    frame: LabelledFrame,
+    frames: LabeledFrames[LabeledFrame],
+    frame: LabeledFrame,
     slices: bool,
     lidar: bool,
     roi: str,
@@ -166,7 +166,7 @@ def _draw(
 @click.command(cls=entry.Command)
 @entry.roots
 @entry.out_file("recording.rrd", "File of the recording.")
-@entry.labelled_frames
+@entry.labeled_frames
 @entry.camera_calibration
 @_detections
 @entry.max_frames
@@ -194,7 +194,7 @@ def view(
     complete = [frame for frame in frames if frame.radar_path]
     if not complete:
         raise UserError(
-            f"no radar tensor or projection for any of {len(frames)} labelled frames"
+            f"no radar tensor or projection for any of {len(frames)} labeled frames"
         )
     shown = complete[:max_frames]
     bar = tqdm.tqdm(shown, desc="record", unit="frame")
@@ -207,7 +207,7 @@ def view(
 
 
 def viewer_scenes(
-    frames: Iterable[LabelledFrame],
+    frames: Iterable[LabeledFrame],
     grid: radejax.RadarGrid,
     detector: radejax.Detector | None = None,
 ) -> Iterator[radejax.Scene]:
@@ -228,7 +228,7 @@ def _open(
     workdir: str | None,
     score_threshold: str | None,
     **part: Any,
-) -> tuple[LabelledFrames[LabelledFrame], radejax.Detector | None]:
+) -> tuple[LabeledFrames[LabeledFrame], radejax.Detector | None]:
     """Returns the frames to draw, and the detector of a run on such data, or None.
 
     The reader is that of the config, or else of the run.
@@ -250,7 +250,7 @@ def _open(
 
 
 def _scene(
-    frame: LabelledFrame,
+    frame: LabeledFrame,
     grid: radejax.RadarGrid,
     detector: radejax.Detector | None,
     *,
@@ -323,5 +323,5 @@ def demo(out: pathlib.Path, seed: int) -> None:
             title=f"simulated frame, seed {seed}, {frame.weather}",
         )
     save_figure(radejax.draw_frame(scene), out)
-    num_labelled = len(frame.boxes)
-    click.echo(f"{len(found)} boxes found, {num_labelled} labelled objects: see {out}")
+    num_labeled = len(frame.boxes)
+    click.echo(f"{len(found)} boxes found, {num_labeled} labeled objects: see {out}")

@@ -15,7 +15,7 @@ from jaxtyping import Real, UInt8
 from radejax.core import manifest
 from radejax.core.archives import wrap_read_errors
 from radejax.core.errors import DataError, UserError
-from radejax.data.dataset import FrameSequence, LabelledFrame
+from radejax.data.dataset import FrameSequence, LabeledFrame
 from radejax.data.options import CameraOptions
 from radejax.data.records import Records
 from radejax.geometry.camera import (
@@ -118,7 +118,7 @@ def no_images(
 
 
 def front_view(
-    frame: LabelledFrame,
+    frame: LabeledFrame,
 ) -> tuple[UInt8[np.ndarray, "H W 3"] | None, CameraCalibration | None]:
     """Returns the left front image of a frame and its calibration for drawing.
 
@@ -261,7 +261,7 @@ def camera_inputs(
 
 
 def _camera(
-    frame: LabelledFrame,
+    frame: LabeledFrame,
     radar_from_lidar_m: tuple[float, ...],
     image_size: tuple[int, int],
     options: CameraOptions,

@@ -13,7 +13,7 @@ from radejax.core.errors import DataError
 from radejax.core.files import JsonObject
 from radejax.core.structures import RARE_SHARE
 from radejax.data.cameras import front_view
-from radejax.data.dataset import FrameSequence, LabelledFrame, LabelledFrames, Summary
+from radejax.data.dataset import FrameSequence, LabeledFrame, LabeledFrames, Summary
 
 Rows = list[JsonObject]
 
@@ -26,7 +26,7 @@ class HealthReport:
         roots: The folders that were checked.
         version: Version of the labels, or name of the reader.
         sequences: One row per sequence with its conditions, its numbers of files, and
-            the numbers of labelled frames without these files.
+            the numbers of labeled frames without these files.
         objects: One row per split and weather with the number of objects of every class
             that training uses: visible to the radar and in its field of view.
         summary: Counts, problems with file and line, and notes.
@@ -80,7 +80,7 @@ def _with_shares(row: JsonObject) -> dict[str, str]:
 
 
 def check_frames(
-    frames: LabelledFrames[LabelledFrame],
+    frames: LabeledFrames[LabeledFrame],
     classes: Sequence[str],
     roots: Sequence[str],
     *,
@@ -99,7 +99,7 @@ def check_frames(
     """
     summary = frames.summary()
     splits = find_splits(frames)
-    sequences: dict[int, list[LabelledFrame]] = {}
+    sequences: dict[int, list[LabeledFrame]] = {}
     for frame in frames:
         sequences.setdefault(frame.sequence, []).append(frame)
     groups = sequences.values()
@@ -125,13 +125,13 @@ def check_frames(
     return HealthReport(list(roots), reader, rows, objects, summary)
 
 
-def _num_missing(frame: LabelledFrame) -> int:
+def _num_missing(frame: LabeledFrame) -> int:
     """Returns how many of radar data, image and calibration a frame lacks."""
     files = frame.radar_path, frame.camera_path, frame.camera_calibration_path
     return files.count(None)
 
 
-def find_splits(data: LabelledFrames[LabelledFrame]) -> dict[str, str]:
+def find_splits(data: LabeledFrames[LabeledFrame]) -> dict[str, str]:
     """Returns the split of every frame and adds problems of the splits to the summary."""
     splits: dict[str, str] = {}
     summary = data.summary()
@@ -142,7 +142,7 @@ def find_splits(data: LabelledFrames[LabelledFrame]) -> dict[str, str]:
         summary.problems[:] = dict.fromkeys(summary.problems + found.problems)
         summary.notes[:] = dict.fromkeys(summary.notes + found.notes)
     summary.problems += [
-        ("split", f"{frame.key}: labelled, but in neither train nor test")
+        ("split", f"{frame.key}: labeled, but in neither train nor test")
         for frame in data
         if frame.key not in splits
     ]

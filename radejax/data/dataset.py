@@ -1,7 +1,7 @@
 """Interface of datasets: frames with their radar data, images and labels.
 
-A reader of a format is a class that is derived from `LabelledFrames`, with frames that are
-derived from `LabelledFrame`. `radejax.data.kradar` is the reader of K-Radar;
+A reader of a format is a class that is derived from `LabeledFrames`, with frames that are
+derived from `LabeledFrame`. `radejax.data.kradar` is the reader of K-Radar;
 docs/own_radar.md shows another one.
 """
 
@@ -84,8 +84,8 @@ class Summary:
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class LabelledFrame:
-    """One labelled frame.
+class LabeledFrame:
+    """One labeled frame.
 
     Frames must be picklable, as other processes compute their projections.
 
@@ -203,13 +203,13 @@ class LabelledFrame:
         return calibration.height, calibration.width
 
 
-FrameSequence = Sequence[LabelledFrame]
+FrameSequence = Sequence[LabeledFrame]
 """A dataset, or a part of one, of which only the frames are read."""
 
-_F = TypeVar("_F", bound=LabelledFrame, covariant=True)
+_F = TypeVar("_F", bound=LabeledFrame, covariant=True)
 
 
-class LabelledFrames(Sequence[_F]):
+class LabeledFrames(Sequence[_F]):
     """The frames of a dataset in a fixed order.
 
     Readers of a format are subclasses with the methods `from_options` and `of_split`.
@@ -363,7 +363,7 @@ class LabelledFrames(Sequence[_F]):
             expected = "1: other names or sequences"
             require(number == 1, f"number of frames {key}", number, expected)
         counts = collections.Counter[str]()
-        frames: list[LabelledFrame] = []
+        frames: list[LabeledFrame] = []
         for frame in self:
             boxes = np.asarray(frame.boxes, np.float64).reshape(-1, 7)
             names = np.asarray(frame.classes)
@@ -400,7 +400,7 @@ class LabelledFrames(Sequence[_F]):
 
 def read_frames(
     options: DataOptions, classes: Sequence[str]
-) -> LabelledFrames[LabelledFrame]:
+) -> LabeledFrames[LabeledFrame]:
     """Reads the frames of the chosen sequences and weathers by the reader of a config.
 
     Args:
@@ -409,7 +409,7 @@ def read_frames(
 
     Raises:
         UserError: There is no such reader, there are no frames, or boxes or columns are
-            wrong, see `LabelledFrames.with_valid_boxes`.
+            wrong, see `LabeledFrames.with_valid_boxes`.
     """
     frames = find_reader(options.format).from_options(options, classes)
     frames = frames.with_valid_boxes(classes).part(options.sequences, options.weather)
@@ -422,7 +422,7 @@ def read_frames(
     return frames
 
 
-def find_reader(name: str) -> type[LabelledFrames[LabelledFrame]]:
+def find_reader(name: str) -> type[LabeledFrames[LabeledFrame]]:
     """Returns the reader of a format.
 
     Args:
@@ -432,8 +432,8 @@ def find_reader(name: str) -> type[LabelledFrames[LabelledFrame]]:
         UserError: There is no such name, or the class cannot be imported.
     """
     place = "radejax.data.kradar:KRadar" if name == "kradar" else name
-    reader: type[LabelledFrames[LabelledFrame]] = find_part(
-        place, "config.data.format", {"kradar": None}, LabelledFrames
+    reader: type[LabeledFrames[LabeledFrame]] = find_part(
+        place, "config.data.format", {"kradar": None}, LabeledFrames
     )
     return reader
 

@@ -137,7 +137,7 @@ def make_table(
 
     Args:
         records: Projections of these frames and possibly others.
-        frames: Labelled frames, normally a split of a `KRadar`.
+        frames: Labeled frames, normally a split of a `KRadar`.
         max_objects: Number of rows N of every frame.
         classes: Class names in the order of the class indices. Objects of other classes
             are not targets and are left out.

@@ -31,7 +31,7 @@ from radejax.core import files, manifest
 from radejax.core.archives import wrap_read_errors
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.workers import default_workers, end_rerun, process_pool
-from radejax.data.dataset import FrameSequence, LabelledFrame, LabelledFrames
+from radejax.data.dataset import FrameSequence, LabeledFrame, LabeledFrames
 from radejax.data.projection import ENCODINGS, decode, encode
 from radejax.geometry.radar_grid import RadarGrid, is_uniform
 
@@ -312,7 +312,7 @@ class PreprocessReport:
 
 
 def preprocess(
-    frames: LabelledFrames[LabelledFrame],
+    frames: LabeledFrames[LabeledFrame],
     folder: files.PathLike,
     *,
     dtype: str | None = None,
@@ -327,7 +327,7 @@ def preprocess(
     in a warning. Several processes may work on different shards of a folder.
 
     Args:
-        frames: Labelled frames, normally a `KRadar` without a split, as the records can
+        frames: Labeled frames, normally a `KRadar` without a split, as the records can
             be used for every split and label revision.
         folder: Folder of the records, which is created if needed.
         dtype: "float16", "uint8" or "float32". None uses the dtype of existing records,
@@ -393,7 +393,7 @@ def _check(records: Records, frames: FrameSequence) -> None:
 
 
 def _write_all(
-    records: Records, frames: Sequence[LabelledFrame], num_workers: int
+    records: Records, frames: Sequence[LabeledFrame], num_workers: int
 ) -> Generator[tuple[str, str], None, None]:
     """Writes the records of frames.
 
@@ -411,7 +411,7 @@ def _write_all(
             yield future.result()
 
 
-def _write(records: Records, frame: LabelledFrame) -> tuple[str, str]:
+def _write(records: Records, frame: LabeledFrame) -> tuple[str, str]:
     """Writes the record of one frame; returns its key and the reason if it was skipped."""
     state = manifest.state_of([frame.radar_path])
     try:

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import PathLike, atomic_write
 from radejax.core.structures import BOX_FIELDS, CLASSES, ROIS, Boxes, frame_key
-from radejax.data.dataset import LabelledFrame
+from radejax.data.dataset import LabeledFrame
 
 KNOWN_CLASSES = (*CLASSES, "Pedestrian Group", "Bicycle Group")
 """Class names that may occur in K-Radar's labels; those not evaluated are ignored."""
@@ -301,14 +301,14 @@ def columns_of(
 
 
 def tables_from_frames(
-    frames: Iterable[LabelledFrame],
+    frames: Iterable[LabeledFrame],
     split: str | None = None,
     targets: Sequence[str] = (),
 ) -> tuple[Boxes, Columns]:
     """Builds ground truth and frame table of a dataset such as `radejax.data.kradar.KRadar`.
 
     Args:
-        frames: The labelled frames.
+        frames: The labeled frames.
         split: Split to store in the frame table: "train", "test", "all" or a split file;
             None if it is not known.
         targets: Names of the frames' `columns` that become columns of the ground truth, NaN
@@ -342,7 +342,7 @@ def tables_from_frames(
     return ground_truth, table
 
 
-def _joined(frames: Sequence[LabelledFrame], name: str) -> Float[np.ndarray, "N ..."]:
+def _joined(frames: Sequence[LabeledFrame], name: str) -> Float[np.ndarray, "N ..."]:
     """Returns a column of the objects of all frames, NaN in frames without it."""
     found = [frame.columns[name] for frame in frames if name in frame.columns]
     inner = found[0].shape[1:] if found else ()

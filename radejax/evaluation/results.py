@@ -44,7 +44,7 @@ LEVEL = 0.95
 """Confidence level of all intervals."""
 
 HOW_TO_CHOOSE = (
-    "`radejax evaluate RUN` does so with config.data.validation, or on other labelled "
+    "`radejax evaluate RUN` does so with config.data.validation, or on other labeled "
     "sequences that --split or --data name"
 )
 """How to choose score thresholds, which is not done on a test split."""

@@ -20,7 +20,7 @@ from radejax.core.files import PathLike
 from radejax.core.grain_import import grain
 from radejax.core.manifest import state_of, warn_of_changes
 from radejax.data.cameras import read_left_image
-from radejax.data.dataset import LabelledFrame
+from radejax.data.dataset import LabeledFrame
 from radejax.data.records import PreprocessReport, Records, embedding_fields
 from radejax.models.dinorade import IMAGE_BACKBONE, DinoRade
 from radejax.weights.image_backbone import weights_sha256
@@ -31,7 +31,7 @@ _log = logging.getLogger(__name__)
 def embed_dataset(
     model: DinoRade,
     variables: VariableDict,
-    frames: Sequence[LabelledFrame],
+    frames: Sequence[LabeledFrame],
     folder: PathLike,
     *,
     dtype: str | None = None,
@@ -78,7 +78,7 @@ def embed_dataset(
     states = {frame.key: state_of([frame.camera_path]) for frame in images}
     skipped: dict[str, str] = {}
 
-    def read(frame: LabelledFrame) -> UInt8[np.ndarray, "H W 3"]:
+    def read(frame: LabeledFrame) -> UInt8[np.ndarray, "H W 3"]:
         assert frame.camera_path is not None
         size = model.options.image.size
         try:

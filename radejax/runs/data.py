@@ -23,8 +23,8 @@ from radejax.data import cameras, pipeline, records
 from radejax.data.augment import Augmentation
 from radejax.data.dataset import (
     FrameSequence,
-    LabelledFrame,
-    LabelledFrames,
+    LabeledFrame,
+    LabeledFrames,
     find_reader,
     held_out,
 )
@@ -39,7 +39,7 @@ from radejax.simulation.dataset import simulate_dataset
 from radejax.training.options import TrainOptions
 from radejax.training.step import make_schedule
 
-Frames = LabelledFrames[LabelledFrame]
+Frames = LabeledFrames[LabeledFrame]
 
 _log = logging.getLogger(__name__)
 

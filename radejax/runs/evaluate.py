@@ -26,7 +26,7 @@ from radejax.core.errors import UserError, require
 from radejax.core.files import JsonObject, PathLike
 from radejax.core.structures import Batch, Boxes, DetectionMaps
 from radejax.data.cameras import require_images
-from radejax.data.dataset import FrameSequence, LabelledFrame, find_reader
+from radejax.data.dataset import FrameSequence, LabeledFrame, find_reader
 from radejax.data.projection import decode
 from radejax.evaluation.analysis import (
     OPERATING_SCORE,
@@ -567,7 +567,7 @@ def _check_source(out: pathlib.Path, source: JsonObject) -> None:
         raise UserError(f"{out} has other results: {'; '.join(lines)}; give --out")
 
 
-def with_shuffled_images(data: Data, split: str, seed: int) -> list[LabelledFrame]:
+def with_shuffled_images(data: Data, split: str, seed: int) -> list[LabeledFrame]:
     """Returns the frames of a split with images and calibrations shuffled among them.
 
     Every frame that has an image gets the image and calibration of another one.

@@ -21,7 +21,7 @@ from radejax.core import files
 from radejax.core.files import JsonObject
 from radejax.core.structures import CLASSES, Array, Batch, Boxes
 from radejax.data.cameras import front_view
-from radejax.data.dataset import FrameSequence, LabelledFrame, find_reader
+from radejax.data.dataset import FrameSequence, LabeledFrame, find_reader
 from radejax.data.options import DataOptions
 from radejax.data.pipeline import read_sample, sample_keys
 from radejax.data.projection import decode
@@ -47,14 +47,14 @@ _log = logging.getLogger(__name__)
 
 
 def frame_scene(
-    frame: LabelledFrame,
+    frame: LabeledFrame,
     projection: ArrayLike,
     grid: RadarGrid,
     *,
     iou: float = 0.3,
     **fields: Any,
 ) -> Scene:
-    """Creates the scene of a labelled frame with its boxes, image, calibration and title.
+    """Creates the scene of a labeled frame with its boxes, image, calibration and title.
 
     Predictions are matched to the objects inside the region by the protocol `all_point`, so
     that figures show which are correct.
@@ -241,7 +241,7 @@ def frame_shares(
     variables: VariableDict,
     data: Data,
     frames: FrameSequence,
-) -> Iterator[tuple[LabelledFrame, Float[np.ndarray, "R A"]]]:
+) -> Iterator[tuple[LabeledFrame, Float[np.ndarray, "R A"]]]:
     """Yields every frame with a map of the camera's weight in the fusion, in [0, 1].
 
     The weight is 0 in bins without a query that projects into the image, and everywhere

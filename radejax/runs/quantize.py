@@ -17,7 +17,7 @@ from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.core.manifest import checksums
 from radejax.core.structures import Boxes, Detections
-from radejax.data.dataset import LabelledFrame
+from radejax.data.dataset import LabeledFrame
 from radejax.data.projection import decode
 from radejax.evaluation.boxes import tables_from_frames
 from radejax.evaluation.results import compute_results, make_set
@@ -100,7 +100,7 @@ def export_int8(
     return num_bytes, left_out
 
 
-def _quantize(folder: pathlib.Path, data: Data, frames: Sequence[LabelledFrame]) -> int:
+def _quantize(folder: pathlib.Path, data: Data, frames: Sequence[LabeledFrame]) -> int:
     """Replaces the ONNX files of a folder; returns by how many bytes they are smaller."""
     from onnxruntime import quantization
 
@@ -131,7 +131,7 @@ def _quantize(folder: pathlib.Path, data: Data, frames: Sequence[LabelledFrame])
 
 
 def _aps(
-    folder: pathlib.Path, config: Config, data: Data, frames: Sequence[LabelledFrame]
+    folder: pathlib.Path, config: Config, data: Data, frames: Sequence[LabeledFrame]
 ) -> dict[str, float]:
     """Returns the APs of the program of a folder by class, boxes and threshold."""
     options = report_options(config)

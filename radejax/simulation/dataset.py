@@ -212,7 +212,7 @@ class Writer:
         return missing
 
     def _write_motion(self, folder: pathlib.Path, specs: list[FrameSpec]) -> None:
-        """Writes the motion of the ego vehicle and of the labelled objects."""
+        """Writes the motion of the ego vehicle and of the labeled objects."""
         sequence = self.source.make(specs[0].sequence)
         tracks = sequence.tracks
         ego = [motion.EGO_HEADER]

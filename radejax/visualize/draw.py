@@ -9,7 +9,7 @@ scenes, x points to the right and y up.
 
 A projection `[R, A, D+E]` consists of two 3D maps: range-azimuth-Doppler (maximum over
 elevation) and range-azimuth-elevation (maximum over Doppler). The Doppler axis wraps
-around at a few meters per second, so it shows the aliased radial velocity and is labelled
+around at a few meters per second, so it shows the aliased radial velocity and is labeled
 as such.
 """
 

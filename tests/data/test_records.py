@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import DataError, UserError
-from radejax.data.dataset import LabelledFrames
+from radejax.data.dataset import LabeledFrames
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.tesseract import project_file, read_tesseract
 from radejax.data.projection import project_tensor
@@ -327,13 +327,13 @@ def test_a_folder_has_records_of_one_kind(data, tmp_path):
     ):
         run(data, tmp_path, dtype="float16")
     with pytest.raises(UserError, match=r"options\.source\.grid\.azimuth_rad differs"):
-        run(LabelledFrames(data, RadarGrid.kradar()), tmp_path)
+        run(LabeledFrames(data, RadarGrid.kradar()), tmp_path)
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda data, _: run(LabelledFrames([], data.grid), "x"), "no frames to preproc"),
+        (lambda data, _: run(LabeledFrames([], data.grid), "x"), "no frames to preproc"),
         (lambda data, _: run(data, "x", dtype="int4"), "dtype is 'int4', expected one of"),
         (lambda data, _: run(data, "x", shard=(2, 2)), "i from 0 to n - 1"),
         (lambda data, _: run(data, "x", shard=(-1, 2)), "i from 0 to n - 1"),

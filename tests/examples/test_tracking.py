@@ -51,13 +51,13 @@ def frames(tmp_path_factory) -> KRadar:
     return tracking.simulate(SimulationOptions(grid=GRID), out, 2, 12)
 
 
-def test_labelled_boxes_as_detections_are_tracked_nearly_perfectly(frames, tmp_path):
+def test_labeled_boxes_as_detections_are_tracked_nearly_perfectly(frames, tmp_path):
     pytest.importorskip("trackeval")
     parts = tracking.consecutive(frames)
     assert [len(part) for part in parts] == [12, 12]
     sequences = {}
     for part in parts:
-        truth = tracking.labelled(part)
+        truth = tracking.labeled(part)
         clock_s = [frame.header.timestamp_s for frame in part]
         tracks = track_frames(truth, clock_s, Tracker(min_hits=1, position_m=0.1))
         sequences[part[0].key] = truth, tracks

@@ -19,7 +19,7 @@ from radejax.training.step import (
     make_train_step,
 )
 
-from ..small_models import drawn, labelled_batch
+from ..small_models import drawn, labeled_batch
 
 SIZE = (32, 576)  # the released crop leaves out 280 columns on both sides
 ALL = [
@@ -138,7 +138,7 @@ def test_two_steps_of_every_config(name, words):
     rng = np.random.default_rng(0)
     projection = rng.random((2, *grid.projection_shape)).astype(np.float16)
     image = rng.integers(0, 256, (2, *SIZE, 3)).astype(np.uint8) if has_camera else None
-    batch = jax.device_put(labelled_batch(projection, image))
+    batch = jax.device_put(labeled_batch(projection, image))
     model = models.build(config.model)
     optimizer = make_optimizer(config.train, lambda _: 1e-3)
     start = create_state(

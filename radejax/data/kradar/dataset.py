@@ -1,4 +1,4 @@
-"""Reader of K-Radar: labelled frames with boxes in the radar frame.
+"""Reader of K-Radar: labeled frames with boxes in the radar frame.
 
 `scan` finds the files, `keys_of_split` chooses label files, `read` reads frames with all of
 their objects, and `select` keeps the wanted objects. Reading starts from the label files:
@@ -23,7 +23,7 @@ from jaxtyping import Float, Shaped
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import PathLike, as_path
 from radejax.core.structures import CLASSES
-from radejax.data.dataset import LabelledFrame, LabelledFrames, Summary
+from radejax.data.dataset import LabeledFrame, LabeledFrames, Summary
 from radejax.data.kradar import conditions, folders, motion
 from radejax.data.kradar.labels import (
     LABEL_CLASSES,
@@ -55,8 +55,8 @@ _SPLIT_FOLDERS = ("split", "resources/split", ".")
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Frame(LabelledFrame):
-    """One labelled frame of K-Radar.
+class Frame(LabeledFrame):
+    """One labeled frame of K-Radar.
 
     The `name` consists of the radar and LiDAR frame numbers, such as `"00033_00001"`.
     `boxes` contains only the objects that the options of the dataset keep. The `columns`
@@ -235,8 +235,8 @@ def keys_of_split(index: Index, split: PathLike | None) -> tuple[list[Key], Summ
     """
     summary = Summary()
     numbers = index.options.sequence_numbers
-    labelled = {number for number, _ in index.label_paths}
-    here = labelled & set(index.sequences) if index.sequences else labelled
+    labeled = {number for number, _ in index.label_paths}
+    here = labeled & set(index.sequences) if index.sequences else labeled
     wanted = here if numbers is None else set(numbers)
     if wanted - here:
         raise UserError(
@@ -245,10 +245,8 @@ def keys_of_split(index: Index, split: PathLike | None) -> tuple[list[Key], Summ
         )
     keys = [key for key in index.label_paths if key[0] in wanted]
     if numbers is None:
-        absent = len(labelled - here)
-        summary.counts["sequences without labels"] = len(
-            set(index.sequences) - labelled
-        )
+        absent = len(labeled - here)
+        summary.counts["sequences without labels"] = len(set(index.sequences) - labeled)
         rest = len(index.label_paths) - len(keys)
         summary.counts["sequences with labels that are not in the roots"] = absent
         summary.counts["frames of sequences that are not in the roots"] = rest
@@ -567,8 +565,8 @@ def _frames_of_split(
     return selected, summary.plus(found).plus(Summary(counts))
 
 
-class KRadar(LabelledFrames[Frame]):
-    """The labelled frames of a K-Radar copy, sorted by sequence and frame.
+class KRadar(LabeledFrames[Frame]):
+    """The labeled frames of a K-Radar copy, sorted by sequence and frame.
 
     Missing or malformed files and lines are skipped, counted and listed in `summary()`.
 

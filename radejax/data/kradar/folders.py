@@ -33,7 +33,7 @@ SIMULATION_MARKER = "simulation.json"
 
 # Regular expressions are used because str.isdecimal also accepts digits of other scripts.
 _SEQUENCE = re.compile(r"[0-9]{1,6}")
-_LABELLED_SEQUENCE = re.compile(r"([0-9]{1,6})(?:_info_label_revised)?")
+_LABELED_SEQUENCE = re.compile(r"([0-9]{1,6})(?:_info_label_revised)?")
 _LABEL_NAME = re.compile(r"[0-9]{1,9}_[0-9]{1,9}\.txt")
 _SPLIT_LINE = re.compile(r"\s*([0-9]{1,6})\s*,\s*([0-9]{1,9}_[0-9]{1,9})(?:\.txt)?\s*")
 _MAX_OFFSET_M = 100.0
@@ -273,7 +273,7 @@ def find_labels(path: pathlib.Path) -> dict[Key, LabelPath]:
     found: dict[Key, LabelPath] = {}
     for place, file in members:
         *folders, name = place.replace("\\", "/").split("/")
-        matches = map(_LABELLED_SEQUENCE.fullmatch, reversed(folders))
+        matches = map(_LABELED_SEQUENCE.fullmatch, reversed(folders))
         sequence = next(filter(None, matches), None)
         if sequence is not None and _LABEL_NAME.fullmatch(name):
             _add_label(found, (int(sequence[1]), frame_key(name)), file)
@@ -312,7 +312,7 @@ def split_by_rule(names: Iterable[str], split: str) -> list[str]:
     Quarters 1 and 3 are for training, quarters 2 and 4 for testing.
 
     Args:
-        names: Names of all labelled frames of the sequence.
+        names: Names of all labeled frames of the sequence.
         split: "train" or "test".
 
     Returns:

@@ -48,7 +48,7 @@ LABEL_CLASSES = tuple(MEDIAN_SIZES_M)
 MAX_SIZE_RATIO = 5.0
 """Largest plausible ratio of a size and its median. In K-Radar's labels v2.1, 25 of 115,229
 objects exceed it: three sedans that are 0.1, 0.6 or 0.24 m long or high, and a group that is
-labelled as a pedestrian of 4.4 m."""
+labeled as a pedestrian of 4.4 m."""
 
 MIN_DISTANCE_M = 0.1
 """Smallest plausible distance of two centers. In K-Radar's labels v2.1, 26 pairs are
@@ -96,7 +96,7 @@ _LINE_END = re.compile(r"\r\n|\n|\r")
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Label:
-    """One labelled object.
+    """One labeled object.
 
     Attributes:
         cls: One of `LABEL_CLASSES`.

@@ -1,4 +1,4 @@
-"""Velocities of labelled objects: from the file of a simulated sequence, or from tracks.
+"""Velocities of labeled objects: from the file of a simulated sequence, or from tracks.
 
 K-Radar's files contain no velocities. The labels of one track id and class are a track, and
 the change of its position over time is its velocity relative to the radar.
@@ -56,7 +56,7 @@ def read_motion(path: PathLike) -> dict[tuple[str, str, int], Motion]:
 def estimate_velocities(
     files: Mapping[Key, LabelFile],
 ) -> dict[Key, Float[np.ndarray, "N 2"]]:
-    """Estimates the velocities of labelled objects relative to the radar.
+    """Estimates the velocities of labeled objects relative to the radar.
 
     Args:
         files: Label files of consecutive frames, sorted by sequence and frame.

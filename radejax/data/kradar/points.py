@@ -10,7 +10,7 @@ from jaxtyping import Float
 from radejax.core.archives import wrap_read_errors
 from radejax.core.errors import DataError, require
 from radejax.core.files import PathLike, as_path, atomic_write
-from radejax.data.dataset import LabelledFrame
+from radejax.data.dataset import LabeledFrame
 from radejax.data.kradar import reduced, tesseract
 from radejax.data.points import Points, cfar_points, percentile_points
 from radejax.geometry.radar_grid import RadarGrid
@@ -79,7 +79,7 @@ def to_columns(
 
 
 def frame_points(
-    frame: LabelledFrame,
+    frame: LabeledFrame,
     grid: RadarGrid,
     method: str = "percentile",
     *,

@@ -3,7 +3,7 @@ import pytest
 
 from radejax.core import files
 from radejax.core.errors import UserError
-from radejax.data.dataset import LabelledFrame, LabelledFrames
+from radejax.data.dataset import LabeledFrame, LabeledFrames
 from radejax.data.kradar import KRadar, motion, write
 from radejax.data.kradar.labels import Label
 
@@ -111,12 +111,12 @@ def test_columns_of_own_readers_are_kept_with_their_boxes():
     boxes = [[20.0, 0, 0, 4, 2, 1.5, 0], [-20.0, 0, 0, 4, 2, 1.5, 0]]
     fields = {"sequence": 1, "name": "a", "boxes": np.array(boxes)}
     fields["classes"] = np.array(["car", "car"])
-    frame = LabelledFrame(**fields, columns={"weight_kg": np.array([900, 800])})
-    (kept,) = LabelledFrames([frame], GRID).with_valid_boxes(["car"])
+    frame = LabeledFrame(**fields, columns={"weight_kg": np.array([900, 800])})
+    (kept,) = LabeledFrames([frame], GRID).with_valid_boxes(["car"])
     assert kept.columns["weight_kg"].tolist() == [900]
-    wrong = LabelledFrame(**fields, columns={"weight_kg": np.array([900])})
+    wrong = LabeledFrame(**fields, columns={"weight_kg": np.array([900])})
     message = (
         "frame 1/a: number of rows of column 'weight_kg' is 1, expected 2, one per"
     )
     with pytest.raises(UserError, match=message):
-        LabelledFrames([wrong], GRID).with_valid_boxes(["car"])
+        LabeledFrames([wrong], GRID).with_valid_boxes(["car"])
