@@ -157,3 +157,26 @@ def test_printed_numbers_are_stored(name: str, stored: set[str]) -> None:
     assert len(printed) > 3
     lost = [x for x in printed if x not in stored and not {*x.split()} <= OTHERS.keys()]
     assert lost == [], "neither in a JSON file of docs/reports nor in OTHERS"
+
+
+def test_the_tables_of_the_simulated_radar_are_stored() -> None:
+    """The numbers of a cell are the first ones that are stored of its statistic."""
+    stored = json.loads((REPORTS / "simulator_statistics.json").read_text())
+    page = (ROOT / "docs" / "simulated_radar.md").read_text(encoding="utf-8")
+    tables = [x for x in page.split("\n\n") if x.startswith("| statistic |")]
+    assert len(tables) == 2
+    for table in tables:
+        lines = [line.split("|")[1:-1] for line in table.splitlines()]
+        columns, _, *rows = [[cell.strip() for cell in line] for line in lines]
+        assert len({*columns} & stored.keys()) == 3
+        for row in rows:
+            for column, cell in zip(columns, row, strict=True):
+                if column in stored:
+                    _check_cell(cell, stored[column][row[0]])
+
+
+def _check_cell(cell: str, values: list[float]) -> None:
+    printed = re.findall(r"[-+]?\d+(?:\.\d+)?", cell)
+    assert printed
+    for text, value in zip(printed, values[: len(printed)], strict=True):
+        assert float(text) == round(value, len(text.partition(".")[2])), cell

@@ -1,7 +1,7 @@
 """Draws the figures of `docs/simulated_radar.md`.
 
 They show full-size maps of each kind of weather, and statistics of the simulated radar and of
-K-Radar's public map.
+a published map of K-Radar.
 """
 
 import numpy as np
@@ -33,6 +33,7 @@ SCENES = (
     ("heavysnow", "highway", "day", 1),
 )
 GRID = RadarGrid.kradar()
+NOISE_ROWS = (GRID.range_m > 30) & (GRID.range_m < 95)
 LIMITS_DB = (112, 168)  # from the noise to the echoes of near trucks; of all maps
 SEEN = {"color": "white", "lw": 1.0, "ls": "-"}
 SIMULATED, REAL = "#0072B2", "#D55E00"
@@ -40,7 +41,7 @@ REAL_PROFILE_DB = {
     (0, 1): 12.4, (1, 5): 4.4, (5, 10): -3.2, (10, 25): -0.7, (25, 50): 0.0, (50, 75): 0.0,
     (75, 100): 0.0, (107, 114): -4.1, (114, 119): 1.1,
 }  # fmt: skip
-"""Bands in m and medians of K-Radar's public map, as in the table of `docs/simulated_radar.md`."""
+"""Bands in m and medians of a map of K-Radar, as in the table of `docs/simulated_radar.md`."""
 REAL_LEAKAGE_DB = -15.5
 UNSEEN = {"color": "#E69F00", "lw": 1.2, "ls": (0, (3, 1))}
 
@@ -152,14 +153,13 @@ def draw_statistics(path):
         levels[0], GRID, ax=ground, color_limits=(104, 135), label="mean power [dB]"
     )
     ground.set_title("one simulated map")
-    inside = (GRID.range_m > 30) & (GRID.range_m < 95)
-    noise_db = [np.median(level[inside]) for level in levels]
+    noise_db = [np.median(level[NOISE_ROWS]) for level in levels]
     draw_bands(bands, levels, noise_db)
     azimuth_deg = np.rad2deg(GRID.azimuth_rad)
     for level, noise in zip(levels, noise_db, strict=True):
         row = np.median(level, axis=1)
         profile.plot(GRID.range_m, row - noise, color=SIMULATED, lw=0.7)
-        above = np.where(inside[:, None], level - row[:, None], 0.0)
+        above = np.where(NOISE_ROWS[:, None], level - row[:, None], 0.0)
         index, peak = np.unravel_index(above.argmax(), above.shape)
         echo = 10 ** (level[index] / 10) - 10 ** (noise / 10)
         with np.errstate(divide="ignore", invalid="ignore"):

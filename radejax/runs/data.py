@@ -44,7 +44,7 @@ Frames = LabeledFrames[LabeledFrame]
 _log = logging.getLogger(__name__)
 
 _INPUT_FRAMES = 20
-_KRADAR_INPUT = 0.63  # mean of projections with the noise of K-Radar's public map
+_KRADAR_INPUT = 0.63  # mean of projections with the noise of a map of K-Radar
 _MAX_INPUT = 3.0  # of the mean that the network sees; usual ones are near 0
 
 
