@@ -58,12 +58,12 @@ class Claim:
 _CAMERA = ("camera", "R+C+W long", "R long")
 _SHORT = ("4", "R+C+W", "R")
 CLAIMS = (
-    Claim("full network better than the plain one", "3", "model", "base", paper=4.73),
+    Claim("full network better than the plain one", "3_realistic", "model", "base", paper=4.73),
     Claim("attention alone does not help", "3", "base", "cbam", paper=1.1),
     Claim("larger heads help", "3", "cbam_heads", "cbam", paper=1.8),
     Claim("dilated neck helps", "3", "model", "cbam_heads", paper=4.0),
-    Claim("attention helps with neck and heads", "3", "model", "no_cbam", paper=2.39),
-    Claim("one stem better than two", "3", "model", "stem", paper=-0.34),
+    Claim("attention helps with neck and heads", "3_realistic", "model", "no_cbam", paper=2.39),
+    Claim("one stem better than two", "3_realistic", "model", "stem", paper=-0.34),
     Claim("narrow decoder is better", "3", "model", "expand", paper=0.79),
     Claim("heatmap sigma 0.75 better than 3", "sigma", "sigma 0.75", "sigma 3", "mean"),
     Claim("heatmap sigma 0.75 better than 1", "sigma", "sigma 0.75", "model", "mean"),
@@ -127,9 +127,15 @@ def verdict(claim: Claim, low: float, high: float) -> str:
     return supported if low > 0 else inconclusive
 
 
+def label(claim: Claim) -> str:
+    """Returns the text of a claim with class and, unless it is `ideal`, radar."""
+    radar = ", realistic" if claim.table.endswith("_realistic") else ""
+    return f"{claim.text} ({claim.cls}{radar})"
+
+
 def draw_claims(path: pathlib.Path) -> None:
     """Draws a forest plot: one row per claim with its interval, and the paper's size."""
-    cfar = Claim("RADE-Net beats CFAR, radar realistic", "", "", "")
+    cfar = Claim("RADE-Net beats CFAR", "cfar_realistic", "", "")
     found = [(cfar, *_against_cfar())] + [(c, *_stored(c)) for c in CLAIMS]
     figure = new_figure(8.0, 8.0, dpi=140)
     axes = figure.add_axes((0.40, 0.15, 0.41, 0.80))
@@ -146,7 +152,7 @@ def draw_claims(path: pathlib.Path) -> None:
         place = {"transform": axes.get_yaxis_transform(), "va": "center", "fontsize": 9}
         axes.text(1.02, row, text, color=color, **place)
         axes.axhline(row, color="0.92", lw=0.6, zorder=0)
-    axes.set_yticks(range(len(found)), [f"{c.text} ({c.cls})" for c, *_ in found])
+    axes.set_yticks(range(len(found)), [label(claim) for claim, *_ in found])
     axes.tick_params(axis="y", length=0, labelsize=9)
     axes.set_ylim(len(found) - 0.4, -0.6)
     axes.axvline(0, color="black", lw=0.9)
