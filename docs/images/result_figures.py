@@ -137,8 +137,8 @@ def draw_claims(path: pathlib.Path) -> None:
     """Draws a forest plot: one row per claim with its interval, and the paper's size."""
     cfar = Claim("RADE-Net beats CFAR", "cfar_realistic", "", "")
     found = [(cfar, *_against_cfar())] + [(c, *_stored(c)) for c in CLAIMS]
-    figure = new_figure(8.0, 8.0, dpi=140)
-    axes = figure.add_axes((0.40, 0.15, 0.41, 0.80))
+    figure = new_figure(9.0, 8.0, dpi=140)
+    axes = figure.add_axes((0.42, 0.15, 0.405, 0.80))
     axes.set_xscale("symlog", linthresh=LINEAR_POINTS, linscale=0.8)
     axes.set_title("AP difference on simulated data (BEV, IoU 0.3)", fontsize=11)
     for row, (claim, difference, low, high) in enumerate(found):
@@ -159,7 +159,7 @@ def draw_claims(path: pathlib.Path) -> None:
     ticks = (-5, -2, 0, 2, 5, 10, 20, 50)
     axes.set_xticks(ticks, [f"{tick:+d}" if tick else "0" for tick in ticks])
     axes.set_xticks([], minor=True)
-    axes.set_xlim(-6.5, 62)
+    axes.set_xlim(-8, 62)
     axes.set_xlabel("points of AP: linear up to 5, logarithmic beyond")
     handles = [
         Line2D([], [], color=color, marker="o", lw=2.2, label=name)
