@@ -7,9 +7,9 @@
 
 The second command trains a DinoRADE of reduced width with the frozen image transformer of the
 first. The third trains the same model without the camera on the same data: the difference is what
-the camera adds. `docs/results.md` lists numbers of the radar `ideal`; those of `realistic`, the
-default, have not been measured. Without an option, the transformer is trained from scratch with
-the rest, for which the dataset is too small.
+the camera adds. `docs/results.md` lists the expected numbers, of `long` with the radar `ideal`
+only. Without an option, the transformer is trained from scratch with the rest, for which the
+dataset is too small.
 
 Options:
 
