@@ -19,7 +19,7 @@ Options:
 - `pretrained`: a frozen image transformer from `--image-backbone`
   (`examples/pretrain_backbone.py` makes one).
 - `resnet50`: a ResNet-50 of a quarter of the width instead of the transformer.
-- `long`: the scenes and schedule of `configs/quickstart.py`, with three times the steps.
+- `long`: the scenes and schedule of `configs/quickstart.py`, with 2.5 times the steps.
 - `short`: a run of two minutes that tests the installation and hardly learns anything.
 """
 

@@ -58,9 +58,9 @@ CONFIGS = pathlib.Path(__file__).resolve().parent / "configs"
 class Config(Options):
     """The options of a run.
 
-    The defaults are the paper's training of RADE-Net on K-Radar. Three fields differ from the
-    paper: `model.cbam` ("official", the released block), `loss.assignment` ("center") and
-    `decode.raw_yaw` ("nms"). `docs/deviations.md` describes them.
+    The defaults are the paper's training of RADE-Net on K-Radar. Four fields differ from the
+    paper: `model.widths` and `model.cbam` (those of the authors' code), `loss.assignment`
+    ("center") and `decode.raw_yaw` ("nms"). `docs/deviations.md` describes them.
     `configs/radenet.py` has presets for the paper and the authors' code.
     """
 
