@@ -200,7 +200,8 @@ def test_the_page_is_run_on_a_file(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     page = pathlib.Path(__file__).resolve().parents[2] / "docs" / "adc.md"
-    (code,) = re.findall(r"^```python\n(.*?)^```", page.read_text("utf-8"), re.M | re.S)
+    text = page.read_text("utf-8")
+    code, calibrate = re.findall(r"^```python\n(.*?)^```", text, re.M | re.S)
     monkeypatch.chdir(tmp_path)
     words = np.random.default_rng(0).integers(-9, 9, 128 * 2 * 4 * 128 * 2)
     words.astype("<i2").tofile("adc_data.bin")
@@ -208,6 +209,19 @@ def test_the_page_is_run_on_a_file(
     exec(code, names)
     assert names["projection"].shape == (128, 48, 128)
     assert np.isfinite(names["projection"]).all()
+    # Channels with errors of gain and phase, and a reflector straight ahead.
+    radar, rng = names["radar"], np.random.default_rng(0)
+    errors = rng.uniform(0.5, 1.5, (2, 4, 1)) * np.exp(
+        2j * rng.uniform(-1, 1, (2, 4, 1))
+    )
+    echo = 100.0 * errors * np.exp(2j * np.pi * 0.15 * np.arange(128))
+    names["samples"] = np.broadcast_to(echo, radar.shape).astype(np.complex64)
+    exec(calibrate, names)
+    beams = names["power"].max((0, 1, 2))
+    expected = adc_to_power(names["samples"] / errors, radar).max((0, 1, 2))
+    np.testing.assert_allclose(
+        beams / beams.max(), expected / expected.max(), atol=1e-3
+    )
 
 
 @pytest.mark.parametrize(

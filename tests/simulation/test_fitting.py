@@ -62,8 +62,12 @@ def test_the_parameters_of_a_simulated_recording_are_found(seed, noise_db, **cha
     power = power * 10.0 ** ((noise_db - 100.0) / 10.0)
     found = fit_radar([power], GRID)
     assert found["noise_db"] == pytest.approx(noise_db, abs=0.8)
-    for name, tolerance in (("range_correlation", 0.05), ("beam_spread_db", 0.3)):
-        assert found[name] == pytest.approx(getattr(wanted, name), abs=tolerance)
+    correlation = wanted.range_correlation
+    assert found["range_correlation"] == pytest.approx(correlation, abs=0.05)
+    # The gains drawn for few independent beams may spread by half of the parameter.
+    state = sensor.draw_state(GRID, wanted, np.random.default_rng(seed))
+    spread_db = np.std(20.0 * np.log10(state.beam_gain))
+    assert found["beam_spread_db"] == pytest.approx(spread_db, abs=0.3)
     assert abs(10.0 * np.log10(found["leakage"] / wanted.leakage)) < 5.0
     # A correlation of 0.01 instead of 0 is that of a pedestal of 0.8 instead of 1.
     assert found["doppler_pedestal"] == pytest.approx(

@@ -81,13 +81,15 @@ def test_predictions_are_scenes(tmp_path, caplog):
     boxes = Boxes.one_frame(
         np.array([[20.0, 1, 0, 4, 2, 1.5, 0.3]]), ["Sedan"], np.array([0.5])
     )
-    detect_files._write_csv(tmp_path / "boxes.csv", boxes, ["3/00033_00001"])
+    detect_files._write_csv(tmp_path / "boxes.csv", [boxes], ["3/00033_00001"])
     (one,) = read_scenes(tmp_path / "boxes.csv")
     assert one.numbers == (3, 33, 1)
     assert (one.cls, one.x, one.yaw) == ("Sedan", 20.0, 0.3)
     assert "boxes.csv: columns score are not used" in caplog.text
     source = LabelSource(SimulationOptions(scenes=str(tmp_path / "boxes.csv")))
     assert [spec.name for spec in source.frames(3)] == ["00033_00001"]
+    center_m = source.make(3).frame(0).boxes[0, :3]
+    np.testing.assert_allclose(center_m, [20.0, 1.0, 0.7])  # from the radar
 
 
 def test_choices_are_those_of_the_simulator():
