@@ -119,7 +119,7 @@ def _other_labels(folder: pathlib.Path) -> None:
 
 def _other_sequences(folder: pathlib.Path) -> None:
     write_kradar(folder, sequences=(1,), num_frames=2)
-    KRadar(folder, sequence_numbers=(1, 9))
+    KRadar(folder, sequences=(1, 9))
 
 
 def _no_images(folder: pathlib.Path) -> None:

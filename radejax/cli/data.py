@@ -79,7 +79,6 @@ def simulate(
     out: pathlib.Path,
     radar: str | None,
     recordings: tuple[str, ...],
-    sequence_numbers: tuple[int, ...] | None,
     full_size: bool,
     num_workers: int | None,
     **fields: object,
@@ -110,7 +109,6 @@ def simulate(
     values = dict(simulation) | (FULL_SIZE if full_size else {})
     if radar is not None:
         values |= read_object(radar, "grid", "radar")
-    fields["sequences"] = sequence_numbers
     values |= {name: value for name, value in fields.items() if value is not None}
     simulation = SimulationOptions(**values)  # `replace` would merge both grids
     radejax.simulate(simulation, out, num_workers=num_workers)
@@ -267,7 +265,7 @@ def points(
     out: pathlib.Path,
     suffix: str,
     config: str | None,
-    sequence_numbers: tuple[int, ...] | None,
+    sequences: tuple[int, ...] | None,
     weather: tuple[str, ...] | None,
     **options: Any,
 ) -> None:
@@ -291,14 +289,12 @@ def points(
     sources: dict[pathlib.Path, pathlib.Path | LabeledFrame] = {}
     read: Callable[[Any], np.ndarray]
     if config is not None:
-        frames = entry.read_frames(
-            paths, config, sequence_numbers=sequence_numbers, weather=weather
-        )
+        frames = entry.read_frames(paths, config, sequences=sequences, weather=weather)
         names = (f"{frame.sequence}/rpc_{frame.name}.{suffix}" for frame in frames)
         sources |= zip(map(out.joinpath, names), frames, strict=True)
         read = functools.partial(frame_points, grid=frames.grid, **options)
     else:
-        files = find_frames(paths, sequence_numbers, weather)
+        files = find_frames(paths, sequences, weather)
         for path in files:
             name = f"rpc_{path.stem.rpartition('_')[2]}.{suffix}"
             target = out.absolute() / sequence_folder(path).name / name

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-import radejax
 from radejax.cli import entry
 from radejax.core.errors import UserError
 
@@ -73,10 +72,11 @@ def detect(
     Example: radejax detect --workdir runs/quickstart --out boxes data/kradar/5
     """
     from radejax.inference.detect_files import detect_files, find_inputs
+    from radejax.inference.detector import Detector
 
     entry.set_up_jax()
     thresholds = {n: options.pop(n) for n in ("score_threshold", "nms_iou")}
-    detector = radejax.Detector.from_workdir(
+    detector = Detector.from_workdir(
         source, step, image_backbone=image_backbone, **thresholds
     )
     inputs = find_inputs(detector, roots, **options)
@@ -181,6 +181,7 @@ def export(
     Example: radejax export runs/quickstart --out exported
     """
     from radejax.inference import export as exporting
+    from radejax.inference.detector import Detector
     from radejax.inference.saved import load_model, with_chosen_thresholds
 
     entry.set_up_jax()
@@ -189,7 +190,7 @@ def export(
     saved = load_model(source, image_backbone=image_backbone)
     if thresholds:
         saved = with_chosen_thresholds(saved, source, thresholds)
-    detector = radejax.Detector(saved, dtype=dtype)
+    detector = Detector(saved, dtype=dtype)
     if int8:
         from radejax.runs.quantize import export_int8
 

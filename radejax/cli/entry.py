@@ -306,7 +306,6 @@ labels = click.option(
 )
 sequences = several(
     "--sequences",
-    "sequence_numbers",
     kind=int,
     metavar="1,5,58",
     help="Use these sequences only. Default: all.",
@@ -340,7 +339,7 @@ def read_frames(
     config: str | Config | None = None,
     *,
     version: str | None = None,
-    sequence_numbers: Sequence[int] | None = None,
+    sequences: Sequence[int] | None = None,
     weather: Sequence[str] | None = None,
     any_visibility: bool = False,
     **paths: str | None,
@@ -351,7 +350,7 @@ def read_frames(
         roots: Folders of the dataset.
         config: Config, or its file or name.
         version: Version of the labels; the config's if None.
-        sequence_numbers: Sequences to read; all if None.
+        sequences: Sequences to read; all if None.
         weather: Weathers to read; all if None.
         any_visibility: Whether objects of every visibility flag are read.
         **paths: Other paths of `config.data`, such as `labels`; the config's if None.
@@ -364,7 +363,7 @@ def read_frames(
     options = settings.data.replace(
         roots=roots,
         label_version=version or settings.data.label_version,
-        sequences=sequence_numbers or (),
+        sequences=sequences or (),
         weather=weather or (),
         visibility=None if any_visibility else settings.data.visibility,
         **{name: path for name, path in paths.items() if path is not None},

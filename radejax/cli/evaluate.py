@@ -295,8 +295,6 @@ def runs(folder: str, as_json: bool) -> None:
 def _given(options: Mapping[str, object]) -> dict[str, Any]:
     """Returns the options that were given, with None for the region "none"."""
     given = {name: value for name, value in options.items() if value is not None}
-    if "sequence_numbers" in given:
-        given["sequences"] = given.pop("sequence_numbers")
     if given.get("roi") == "none":
         given["roi"] = None
     return given

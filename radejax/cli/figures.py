@@ -86,8 +86,8 @@ def overlay(
     sequence, _, frame_name = name.partition("/")
     frame_name = frame_key(frame_name)
     if sequence.isdecimal():
-        part["sequence_numbers"] = (int(sequence),)
-    elif name or not (part["sequence_numbers"] or part["weather"]):
+        part["sequences"] = (int(sequence),)
+    elif name or not (part["sequences"] or part["weather"]):
         raise UserError(f"frame {name!r}, expected sequence/radar_lidar: 1/00033_00001")
     if slices and lidar:
         raise UserError("--slices shows no LiDAR points: leave out --lidar or --slices")

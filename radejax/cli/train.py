@@ -127,7 +127,6 @@ def train(
             processes.enter_context(end_with_others())
         # Parts that a config names are imported, and may use JAX.
         settings = with_texts(load_config(config), fields)
-        data["sequences"] = data.pop("sequence_numbers")
         settings = settings.replace(data={name: x for name, x in data.items() if x})
         if draw_samples is not None:
             figure_format(draw_samples)  # checks the ending before data are prepared

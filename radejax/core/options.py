@@ -89,8 +89,9 @@ class Options(pydantic.BaseModel):
         """Returns validated options with other values.
 
         Args:
-            **changes: Fields to replace. A mapping changes the named fields of a section and
-                keeps its others; an instance of `Options` replaces the section.
+            **changes: Fields to replace. A mapping changes the named fields of a section, or
+                of a mapping such as `loss.weights`, and keeps the others; an instance of
+                `Options` replaces the section.
 
         Examples:
             config.replace(seed=1, train={"batch_size": 4})

@@ -153,6 +153,8 @@ class LabeledFrame:
     def read_projection(self, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
         """Reads the radar data and computes their projection, see `project_tensor`.
 
+        The files of K-Radar are read by `read_frame` in `kradar/tesseract.py`.
+
         Args:
             grid: Sensor axes, those of the dataset.
 
@@ -163,7 +165,7 @@ class LabeledFrame:
         raise NotImplementedError
 
     def read_checked(self, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
-        """Reads the projection and checks shape and values.
+        """Calls `read_projection` and checks shape and values.
 
         Raises:
             FileNotFoundError: The frame has no radar file.

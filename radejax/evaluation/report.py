@@ -219,7 +219,7 @@ def _all_tables(metrics: JsonObject, tables: RunTables) -> list[Table]:
     built = []
     if not metrics["is_simulated"] and options.label_version:
         built += tables.papers()
-    for space, iou in itertools.product(SPACES, options.iou_thresholds):
+    for space, iou in itertools.product(TABLE_SPACES, options.iou_thresholds):
         built.append(tables.by_protocol(space, iou))
     for protocol, iou in itertools.product(options.protocols, options.iou_thresholds):
         built.append(tables.by_weather(protocol, iou))
@@ -245,7 +245,7 @@ def _console_text(metrics: JsonObject, tables: RunTables) -> str:
     first, *others = options.main_protocols
     built = [tables.by_weather(first, level) for level in options.iou_thresholds[:2]]
     built += [tables.by_weather(protocol, iou) for protocol in others]
-    built += [tables.by_protocol(space, iou) for space in SPACES]
+    built += [tables.by_protocol(space, iou) for space in TABLE_SPACES]
     built.append(subset_table(metrics["subsets"], "distance"))
     chosen_on = metrics["thresholds"]["chosen_on"]
     if chosen_on:
@@ -296,7 +296,7 @@ def _draw_curves(
     figures = {}
     masks: dict[str, Any] = {"all": None, **condition_masks(frames, "weather")}
     settings: dict[str, Any] = {"iou_thresholds": iou, **options.settings_of(protocol)}
-    for space in SPACES:
+    for space in TABLE_SPACES:
         panels: dict[str, dict[str, Curve]] = {}
         for name, mask in masks.items():
             lines = panels.setdefault(TITLES.get(name, name), {})
@@ -428,7 +428,7 @@ def plain(values: JsonObject) -> JsonObject:
 TITLES = {"all": "Total"} | {
     name: name.replace("snow", " snow").title() for name in WEATHERS
 }
-SPACES = ("3d", "bev")
+TABLE_SPACES = ("3d", "bev")
 """Box spaces in the order of the papers' tables."""
 
 STYLES = {"text": "simple", "markdown": "github", "latex": "latex_booktabs"}
@@ -713,7 +713,9 @@ class RunTables:
         conditions = dict.fromkeys(key[1] for key in self.results)
         body = []
         for cls in (*self.options.classes, "mean"):
-            pairs = [[Cell(name, cls, x, iou) for x in SPACES] for name in conditions]
+            pairs = [
+                [Cell(name, cls, x, iou) for x in TABLE_SPACES] for name in conditions
+            ]
             entries = [numbers(self._aps(protocol, pair)) for pair in pairs]
             body.append([cls, *map(" / ".join, entries)])
         title = f"AP 3D / BEV at IoU {iou:g}, {self._terms(protocol)}"
@@ -746,7 +748,7 @@ class RunTables:
         """
         if 0.3 not in self.options.iou_thresholds:
             return []
-        spaces: list[Place] = [{"space": space} for space in SPACES]
+        spaces: list[Place] = [{"space": space} for space in TABLE_SPACES]
         conditions = [{"condition": name} for name in CONDITIONS]
         classes = [{"cls": cls} for cls in (*self.options.classes, "mean")]
         of_others = ("Sedan", "Bus or Truck", "mean")  # classes of most other methods

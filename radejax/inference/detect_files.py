@@ -90,7 +90,7 @@ def front_images(
         version=detector.saved.config.data.label_version,
         visibility=None,
         field_of_view=False,
-        sequence_numbers={int(folder.name) for folder in sequences},
+        sequences={int(folder.name) for folder in sequences},
         camera_calibration=camera_calibration,
         common_camera=detector.camera_options.calibration == "common",
     )
@@ -173,7 +173,7 @@ def find_inputs(
     detector: Detector,
     paths: Sequence[PathLike],
     *,
-    sequence_numbers: Sequence[int] | None = None,
+    sequences: Sequence[int] | None = None,
     weather: Sequence[str] | None = None,
     labels: PathLike | None = None,
     camera_calibration: PathLike | None = None,
@@ -183,7 +183,7 @@ def find_inputs(
     Args:
         detector: Detector of the frames.
         paths: Files and folders of frames.
-        sequence_numbers: Numbers of the sequences to take, see `find_frames`.
+        sequences: Numbers of the sequences to take, see `find_frames`.
         weather: Kinds of weather to take, see `find_frames`.
         labels: Label revision in which a radar-camera model's images are looked up; the
             revision that the run was trained with if None.
@@ -202,13 +202,13 @@ def find_inputs(
     camera_calibration = camera_calibration or config.data.camera_calibration
     # A derived reader may read frames in another way.
     if find_reader(config.data.format) is KRadar:
-        found = find_frames(paths, sequence_numbers, weather)
+        found = find_frames(paths, sequences, weather)
         return _of_files(found, paths, detector, labels, camera_calibration)
     options = config.data.replace(
         roots=tuple(paths),
         labels=labels,
         camera_calibration=camera_calibration,
-        sequences=tuple(sequence_numbers or ()),
+        sequences=tuple(sequences or ()),
         weather=tuple(weather or ()),
     )
     frames = read_frames(options, config.classes)

@@ -26,7 +26,7 @@ Batches = Iterable[tuple[Int[Array, " B"], Item]]
 def detect_batches(
     detector: Detector, parts: Iterable[Batches], num_frames: int, *, progress: bool
 ) -> Iterator[tuple[Int[np.ndarray, " B"], Detections]]:
-    """Detects the objects in batches of frames, of which two are in flight.
+    """Detects the objects in batches of frames by `Detector.stream`, two in flight.
 
     Args:
         detector: Detector.

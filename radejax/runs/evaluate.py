@@ -469,8 +469,9 @@ def evaluate_run(
     if usual["roi"] is not None:  # changes name the known regions
         usual["roi"] = roi_name(usual["roi"])
     # A wrong change fails before labels are read, which takes long.
-    options = report_options(saved.config, **changes)
+    report_options(saved.config, **changes)
     config, data = data_of_run(saved, other)
+    options = report_options(config, **changes)
     name = "evaluation" if other is None else f"evaluation_{data_name(other)}"
     name += "" if split == "test" else f"_{files.as_path(split).stem}"
     name += "" if shuffle_images is None else "_shuffled"

@@ -238,7 +238,7 @@ class LabelSource:
                 version=options.label_version,
                 visibility=None,
                 field_of_view=False,
-                sequence_numbers=options.sequences,
+                sequences=options.sequences,
             )
             data = list(labels)
         self._options = options

@@ -330,7 +330,7 @@ def initial_variables(
     """Creates the variables of step 0.
 
     Args:
-        model: Radar or radar-camera detector.
+        model: Detector of `models.build`, a `RadeNet` or `DinoRade`.
         seed: Seed of the run.
         batch: A batch with the shapes of the model's inputs.
         variables: Variables to start from; initialized from the seed if None.
@@ -360,7 +360,7 @@ def make_train_step(
     the optimizer's state unchanged; the train state counts it.
 
     Args:
-        model: Radar or radar-camera detector.
+        model: Detector of `models.build`, a `RadeNet` or `DinoRade`.
         optimizer: Optimizer that `make_optimizer` returned.
         grid: Grid of the model's maps.
         loss: Options of the loss.
@@ -411,6 +411,7 @@ def make_train_step(
                 frozen={},
             )
 
+        # `cond` would copy the frozen parameters, which do not change.
         after = jax.lax.cond(is_finite, update, lambda: state.replace(frozen={}))
         after = after.replace(
             step=state.step + 1,

@@ -245,7 +245,7 @@ def test_a_part_of_the_data_is_chosen(
     seen = []
 
     def look(*_: object, **options: object) -> None:
-        seen.append((options["sequence_numbers"], options["weather"]))
+        seen.append((options["sequences"], options["weather"]))
         raise UserError("opened")
 
     monkeypatch.setattr(check, "check_dataset", look)

@@ -120,8 +120,16 @@ def evaluated(
         loaded = SimpleNamespace(config=Config(), **saved)
         evaluation = SimpleNamespace(report=lambda *_, **named: written.update(named))
         monkeypatch.setattr(evaluate, "load_model", lambda *_, **__: loaded)
-        monkeypatch.setattr(evaluate, "data_of_run", lambda *_: (loaded.config, data))
-        monkeypatch.setattr(evaluate, "Evaluation", lambda *_, **__: evaluation)
+
+        def data_of_run(saved: Any, other: dict[str, Any] | None) -> Any:
+            return saved.config.replace(data=other or {}), data
+
+        def make_evaluation(*_: Any, **named: Any) -> Any:
+            written.update(named)
+            return evaluation
+
+        monkeypatch.setattr(evaluate, "data_of_run", data_of_run)
+        monkeypatch.setattr(evaluate, "Evaluation", make_evaluation)
         evaluate.evaluate_run(tmp_path, **options)
         return written
 
@@ -164,6 +172,19 @@ def test_folder_and_remark_follow_the_options(
     assert written["run"] == name
     assert written["compared"] == ("mean", options.get("split", "test"))
     assert ("may not be reported" in caplog.text) == bool(remark)
+
+
+def test_the_report_names_the_label_version_that_was_read(
+    evaluated: Callable[..., dict[str, Any]],
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    assert evaluated("test")["options"].label_version == "v2.1"
+    data: Any = {"images": lambda _: None, "split": lambda _: []}
+    monkeypatch.setitem(DATA, "images", data["images"])
+    monkeypatch.setitem(DATA, "split", data["split"])
+    written = evaluated("test", other={"label_version": "v1.0"}, out=tmp_path)
+    assert written["options"].label_version == "v1.0"
 
 
 def test_calibration_of_a_run_is_stored_with_it(

@@ -50,7 +50,7 @@ def check_dataset(
             finds all corruption and takes hours.
         progress: Whether to show a progress bar.
         **options: Options of `KRadar`: `labels`, `version`, `camera_calibration`, and the
-            `sequence_numbers` and `weather` of the sequences to check.
+            `sequences` and `weather` of the sequences to check.
 
     Raises:
         FileNotFoundError: A root or `labels` does not exist.
@@ -64,7 +64,7 @@ def check_dataset(
     groups = itertools.groupby(data, key=lambda frame: frame.sequence)
     frames = {number: list(group) for number, group in groups}
     folders = dict(data.files.sequences)
-    if any(options.get(name) is not None for name in ("sequence_numbers", "weather")):
+    if any(options.get(name) is not None for name in ("sequences", "weather")):
         if not frames:
             raise UserError("no frames of these sequences and weathers")
         folders = {number: folders[number] for number in frames}

@@ -116,7 +116,7 @@ class ReadOptions:
             objects too, as in the authors' code.
         classes: Classes to keep.
         field_of_view: Whether to keep only boxes whose center is in the field of view.
-        sequence_numbers: Sequences to read, or None for all. None skips and counts
+        sequences: Sequences to read, or None for all. None skips and counts
             sequences that have labels but no folder in the roots, if roots are given.
         weather: Weathers of the sequences to keep, or None for all.
         camera_calibration: Folder of camera calibrations (`calib_seq_v2/`, `common/`).
@@ -132,14 +132,14 @@ class ReadOptions:
     include_unstarred_v11_labels: bool = False
     classes: Collection[str] = CLASSES
     field_of_view: bool = True
-    sequence_numbers: Collection[int] | None = None
+    sequences: Collection[int] | None = None
     weather: Collection[str] | None = None
     camera_calibration: PathLike | None = None
     common_camera: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "version", normalize_version(self.version))
-        for name in ("visibility", "classes", "sequence_numbers", "weather"):
+        for name in ("visibility", "classes", "sequences", "weather"):
             values = getattr(self, name)
             if not isinstance(values, str | None):  # iterators can be read only once
                 object.__setattr__(self, name, tuple(values))
@@ -234,7 +234,7 @@ def keys_of_split(index: Index, split: PathLike | None) -> tuple[list[Key], Summ
     They are those of a split in the chosen sequences.
     """
     summary = Summary()
-    numbers = index.options.sequence_numbers
+    numbers = index.options.sequences
     labeled = {number for number, _ in index.label_paths}
     here = labeled & set(index.sequences) if index.sequences else labeled
     wanted = here if numbers is None else set(numbers)
@@ -634,7 +634,7 @@ class KRadar(LabeledFrames[Frame]):
             visibility=options.visibility,
             include_unstarred_v11_labels=options.include_unstarred_v11_labels,
             classes=classes,
-            sequence_numbers=options.sequences or None,
+            sequences=options.sequences or None,
             weather=options.weather or None,
             camera_calibration=options.camera_calibration,
             common_camera=options.used_camera.calibration == "common",

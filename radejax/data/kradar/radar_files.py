@@ -19,7 +19,7 @@ PATTERNS = ("tesseract_*.mat", "DERA_tesseract_*.npy", "polar3d_*.npy", "rpc_*.n
 
 def find_frames(
     paths: Sequence[PathLike],
-    sequence_numbers: Sequence[int] | None = None,
+    sequences: Sequence[int] | None = None,
     weather: Sequence[str] | None = None,
 ) -> list[pathlib.Path]:
     """Finds radar files in files and folders.
@@ -29,7 +29,7 @@ def find_frames(
     Args:
         paths: Files, which are taken whatever their name, and folders, which are searched
             recursively.
-        sequence_numbers: Numbers of the sequences to take; all if None.
+        sequences: Numbers of the sequences to take; all if None.
         weather: Kinds of weather to take, according to the `description.txt` of each
             sequence; all if None.
 
@@ -50,8 +50,8 @@ def find_frames(
             if sequence_number(folder) is not None:
                 found.update(files.find_files(folder, *PATTERNS))
     folders = {sequence_folder(path) for path in found}
-    if sequence_numbers:
-        folders = {f for f in folders if sequence_number(f) in sequence_numbers}
+    if sequences:
+        folders = {f for f in folders if sequence_number(f) in sequences}
     if weather:
         check_weather(weather)
         descriptions = {f: read_description(f / "description.txt") for f in folders}
@@ -62,7 +62,7 @@ def find_frames(
         if sequence_folder(path) in folders
     }
     if not frames:
-        asked = map(str, [*paths, *(sequence_numbers or ()), *(weather or ())])
+        asked = map(str, [*paths, *(sequences or ()), *(weather or ())])
         raise UserError(
             f"no frames for {', '.join(asked)}: looked for {' and '.join(PATTERNS)}"
         )

@@ -136,7 +136,7 @@ def test_the_header_names_the_files_of_a_frame(tmp_path):
         (lambda root: KRadar(root, classes=()), r"classes is \(\), expected at least one"),
         (lambda root: KRadar(root, weather=("mist",)), r"unknown weather \('mist',\)"),
         (lambda root: KRadar(root, weather=()), "unknown weather"),
-        (lambda root: KRadar(root, sequence_numbers=[9]), r"no labels .*\[9\]; .*\[1\]"),
+        (lambda root: KRadar(root, sequences=[9]), r"no labels .*\[9\]; .*\[1\]"),
         (lambda root: KRadar(root), r"not an object of v2\.1 .*--config\.data\.label_vers"),
     ],
 )  # fmt: skip
@@ -249,4 +249,4 @@ def test_labels_of_sequences_that_are_not_here_are_left_out_and_counted(
     assert data.counts["frames of sequences that are not in the roots"] == 6
     assert len(KRadar(None, labels)) == 12  # labels alone
     with pytest.raises(UserError, match=r"no folders in the roots, of sequences \[2\]"):
-        KRadar(part, labels, sequence_numbers=[1, 2])
+        KRadar(part, labels, sequences=[1, 2])

@@ -25,7 +25,7 @@ def test_rule_and_file(tmp_path):
     keys, data = select(tmp_path, split="train")
     assert keys == [KEYS[i] for i in (0, 1, 4, 5)]
     assert select(tmp_path)[0] == KEYS
-    assert select(tmp_path, sequence_numbers=[2])[0] == KEYS[8:]
+    assert select(tmp_path, sequences=[2])[0] == KEYS[8:]
     assert "K-Radar's rule" in data.summary().to_text()
     # A file in `split/` takes precedence over the rule.
     write.write_splits(tmp_path / "split", [KEYS[7], KEYS[3]], [])
