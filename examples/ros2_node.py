@@ -51,7 +51,8 @@ def main(workdir, frame_id, box_z):
 
     def publish(message):
         tensor = np.array(message.data, np.float32).reshape(detector.grid.shape_drea)
-        projection, result = project_tensor(tensor), Detection3DArray()
+        projection = detector.grid.measured_channels(project_tensor(tensor))
+        result = Detection3DArray()
         result.header.frame_id, now = frame_id, node.get_clock().now()
         result.header.stamp = now.to_msg()
         for position, quaternion, size, cls, score in box_fields(

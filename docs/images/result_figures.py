@@ -117,16 +117,15 @@ def _against_cfar() -> tuple[float, float, float]:
     return row["difference"], row["low"], row["high"]
 
 
-def verdict(claim: Claim, low: float, high: float) -> str:
+def verdict(claim: Claim, difference: float, low: float, high: float) -> str:
     """Returns the verdict by the rule of the page."""
     supported, not_reproduced, inconclusive, not_tested = VERDICTS
     if not claim.is_tested:
         return not_tested
-    if high < 0 or (
-        claim.names_size and claim.paper is not None and high < claim.paper
-    ):
+    size = claim.paper if claim.names_size and claim.paper is not None else 0.0
+    if high < max(size, 0.0):
         return not_reproduced
-    return supported if low > 0 else inconclusive
+    return supported if low > 0 and difference >= size else inconclusive
 
 
 def label(claim: Claim) -> str:
@@ -144,7 +143,7 @@ def draw_claims(path: pathlib.Path) -> None:
     axes.set_xscale("symlog", linthresh=LINEAR_POINTS, linscale=0.8)
     axes.set_title("AP difference on simulated data (BEV, IoU 0.3)", fontsize=11)
     for row, (claim, difference, low, high) in enumerate(found):
-        color = VERDICTS[verdict(claim, low, high)]
+        color = VERDICTS[verdict(claim, difference, low, high)]
         axes.plot([low, high], [row, row], color=color, lw=2.2, zorder=3)
         inside = color if claim.is_tested else "white"
         axes.plot(difference, row, "o", color=color, mfc=inside, ms=6, zorder=4)

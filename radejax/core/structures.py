@@ -83,8 +83,7 @@ class Batch(struct.PyTreeNode):
         frame: int32 index of the frame in its dataset; -1 for frames that pad the batch.
         image: `[B, H, W, 3]` uint8 left front camera images, the features that the image
             backbone computed from them, or None.
-        camera: `Camera` or `ReferencePoints` with a leading axis B, or None. Both are
-            defined in higher layers.
+        camera: `Camera` or `ReferencePoints` with a leading axis B, or None.
         targets: `[B, N, ...]` columns of `config.data.targets` by name; NaN where a value
             is unknown, 0 where not `is_valid`.
     """

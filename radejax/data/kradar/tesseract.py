@@ -71,8 +71,7 @@ def project_file(
     """Computes `project_tensor` of a file.
 
     Uncompressed floats are streamed: every azimuth is reduced while it is in the cache, and
-    the 260 MB are never in memory. (A memory map would save as much, but a bad disk sector
-    would then kill the process.)
+    the 260 MB are never in memory.
 
     Args:
         path: `tesseract_*.mat` with the variable `arrDREA`, linear power.
