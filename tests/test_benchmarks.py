@@ -7,7 +7,6 @@ import pathlib
 import subprocess
 import sys
 import types
-from typing import Any
 
 import pytest
 
@@ -27,80 +26,6 @@ def modules(monkeypatch: pytest.MonkeyPatch) -> types.SimpleNamespace:
     monkeypatch.setattr(run, "SECONDS_A_CASE", 0.05)
     monkeypatch.setattr(run.rival, "start", lambda platform: None)
     return types.SimpleNamespace(run=run, page=page, case=case, stages=stages)
-
-
-def test_cases_are_compared_alternated_and_stored(
-    modules: types.SimpleNamespace, tmp_path: pathlib.Path
-) -> None:
-    order: list[str] = []
-
-    def call(name: str, seconds: float) -> tuple[float, float]:
-        order.append(name)
-        return seconds, 2 * seconds
-
-    def case(**fields: Any) -> Any:
-        seconds = {"radejax": 0.02, "rival": 0.05}
-        columns = {k: functools.partial(call, k, v) for k, v in seconds.items()}
-        return modules.case.Case(**{"columns": columns, "frames": 2} | fields)
-
-    def fails(_: Any) -> Any:
-        raise RuntimeError("out of memory")
-        yield
-
-    chosen = {
-        "good": lambda _: iter([case(name="equal", error=1e-6)]),
-        "other": lambda _: iter([case(name="differs", error=float("nan"))]),
-        "bad": fails,
-        "late": lambda _: iter([case(name="too late")]),
-    }
-    machine = modules.run.machine_of()
-    result = modules.run.run({k: chosen[k] for k in list(chosen)[:3]}, 600.0, machine)
-    result["rows"] += modules.run.run({"late": chosen["late"]}, -1.0, machine)["rows"]
-    assert order == ["radejax", "rival"] * (len(order) // 2)
-    row, other, bad = result["rows"]
-    assert row["wall_s"] == {"radejax": 0.02, "rival": 0.05}
-    assert "wall_s" not in other
-    assert other["refused"].startswith("results differ by")
-    assert bad["refused"] == "RuntimeError('out of memory')"
-    modules.page.store(result, tmp_path)
-    (file,) = tmp_path.iterdir()
-    text = modules.page.table({"runs": json.loads(file.read_text())["runs"]})
-    times = "10 ms (20 ms) | rival 25 ms (50 ms) | 2.50 | 1e-06"
-    assert f"| equal | float32 | 2 | {times} |" in text
-    found, complete = modules.page.measured(modules.run.facts(machine), tmp_path)
-    assert found == {("equal", "float32", 2)}  # not measured again
-    assert complete == {"good"}
-
-
-def test_the_committed_page_is_what_the_committed_files_give(
-    modules: types.SimpleNamespace,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: pathlib.Path,
-) -> None:
-    committed, page = modules.page.PAGE.read_text(), tmp_path / "page.md"
-    page.write_text(committed)
-    monkeypatch.setattr(modules.page, "PAGE", page)
-    modules.page.write_page()
-    assert page.read_text() == committed, "python benchmarks/run.py --tables"
-
-
-def test_the_latency_table_is_that_of_the_stored_result(
-    modules: types.SimpleNamespace,
-) -> None:
-    import latency
-
-    result = json.loads(latency.RESULT.read_text())
-    page = latency.PAGE.read_text()
-    assert latency.table(result) in page, "python benchmarks/latency.py"
-    names = [variant.name for variant in latency.VARIANTS]
-    assert [row["name"] for row in result["rows"]] == names
-    means = [line for line in result["int8"] if line.startswith("| mean")]
-    assert len(means) == 4
-    for line in means:
-        _, name, exact, quantized, _ = map(str.strip, line.split("|"))
-        _, space, iou = name.split(", ")
-        known = f"| mean AP {space.upper()}, {iou} | {exact} | {quantized} |"
-        assert known in page
 
 
 @pytest.mark.slow  # compiles each stage on its own

@@ -7,17 +7,12 @@ import ast
 import doctest
 import importlib
 import pathlib
-import re
 from collections.abc import Iterator
 
 import pytest
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
-PURE = ("geometry", "losses", "detection", "evaluation")
-"""Packages of functions from arrays to arrays."""
 
-REPORTS = ("comparison", "files", "html", "kitti", "report", "results")
-"""Modules of `evaluation` that read, write or compose reports."""
 
 Documented = ast.FunctionDef | ast.ClassDef
 
@@ -51,32 +46,3 @@ def test_examples_run(name: str) -> None:
     said: list[str] = []
     doctest.DocTestRunner().run(example, out=said.append)
     assert not said, "".join(said)
-
-
-def test_every_public_function_of_the_pure_packages_has_an_example() -> None:
-    lacking = [
-        name
-        for name, (module, node) in NODES.items()
-        if module.split(".")[1] in PURE
-        and module.count(".") == 2
-        and module.split(".")[2] not in REPORTS
-        and name == f"{module}.{node.name}"
-        and isinstance(node, ast.FunctionDef)
-        and not node.name.startswith("_")
-        and name not in EXAMPLES
-    ]
-    assert not lacking
-
-
-def test_functions_are_described_in_the_third_person() -> None:
-    """Properties have noun phrases, and commands the imperative of help texts."""
-    other = re.compile(r"property|(^|\.)(command|group)\(")
-    wrong = [
-        f"{name}: {text.splitlines()[0]}"
-        for name, (_, node) in NODES.items()
-        if isinstance(node, ast.FunctionDef)
-        and not any(other.search(ast.unparse(x)) for x in node.decorator_list)
-        and (text := ast.get_docstring(node))
-        and not re.match(r"[A-Z][a-z]*[^s]s\b", text)
-    ]
-    assert not wrong

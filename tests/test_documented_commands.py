@@ -127,16 +127,6 @@ def _check_train(arguments: list[str]) -> None:
     with_texts(settings, {name: values.get(text, text) for name, text in texts})
 
 
-def test_the_config_file_of_the_page_is_read(tmp_path: pathlib.Path) -> None:
-    page = (ROOT / "docs" / "training.md").read_text(encoding="utf-8")
-    (block,) = re.findall(r"^```python\n(.*?)^```", page, re.M | re.DOTALL)
-    path = tmp_path / "own.py"
-    path.write_text(block, encoding="utf-8")
-    config = load_config(f"{path}:short")
-    assert (config.train.batch_size, config.data.weather) == (4, ("fog", "rain"))
-    assert config.loss.gwd_transform == "none"  # of the preset
-
-
 @functools.cache
 def _help(script: str) -> str:
     """Output of `python script --help`, run in this process to share imports."""

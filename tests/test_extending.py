@@ -26,7 +26,6 @@ from radejax.data.dataset import LabeledFrames, find_reader
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.check import check_dataset
 from radejax.data.options import DataOptions
-from radejax.data.points import cfar_points, percentile_points
 from radejax.data.projection import project_tensor
 from radejax.data.records import Records, preprocess
 from radejax.inference.detect_files import detect_files, find_inputs
@@ -151,24 +150,6 @@ def test_configs_may_name_the_parts_and_the_model_has_them() -> None:
     assert len(made["backbone"]) == 3
 
 
-def test_own_models_may_have_a_camera(tmp_path: pathlib.Path) -> None:
-    text = (
-        "from radejax.models.dinorade import DinoRade\n"
-        "from radejax.models.options import DinoRadeOptions\n"
-        "class OwnOptions(DinoRadeOptions):\n    gain: float\n"
-        "class Own(DinoRade):\n    options: OwnOptions\n"
-    )
-    (tmp_path / "modules" / "parts.py").write_text(text)
-    sections = dict(small.camera_config())
-    fields = dict(sections.pop("model")) | {"name": "parts:Own"}
-    model = models.build(Config(**sections, model=fields | {"gain": 2.0}).model)
-    assert models.has_camera(model)
-    assert type(model).__name__ == "Own"
-    assert model.options.gain == 2.0
-    with pytest.raises(UserError, match=r"config\.model\.gain is missing"):
-        Config(**sections, model=fields)
-
-
 def test_records_of_other_files_or_of_another_reader_are_reported(
     tmp_path: pathlib.Path,
     caplog: pytest.LogCaptureFixture,
@@ -229,27 +210,6 @@ def test_commands_read_such_data_by_the_config(
     text = run("preprocess", root, *given, "--out", out, "--sequences", 2)
     assert "2 preprocessed" in text
     assert Records.open(out).keys() == {"2/0001", "2/0002"}
-
-    grid = small.small_grid()
-    projection = _read_toy(root)[1].read_projection(grid)
-    expected = {
-        "cfar": cfar_points(projection, grid, threshold_db=0.0),
-        "percentile": percentile_points(projection, grid, 0.02),
-    }
-    (block,) = (block for block in RADAR_BLOCKS if block.startswith("points = "))
-    names = {"frame": _read_toy(root)[1], "GRID": grid}
-    exec(f"from radejax.data.points import *\n{block}", names)
-    found = percentile_points(projection, grid, 0.01)
-    np.testing.assert_array_equal(names["strongest"].x_m, found.x_m)
-    assert len(names["points"].x_m) < len(expected["cfar"].x_m)
-    for method, points in expected.items():
-        out = tmp_path / method
-        words = [f"--method={method}", "--rate=0.02", "--threshold-db=0"]
-        assert "4 prepro" in run("points", root, *given, *words, "--out", out)
-        found = np.load(out / "1" / "rpc_0002.npy")
-        assert len(found)
-        np.testing.assert_allclose(found[:, :3], np.stack(points[:3], axis=1))
-        np.testing.assert_array_equal(found[:, 8:], np.stack(points[5:], axis=1))
 
     scenes: list[Scene] = []
     drawn = radejax.draw_frame
@@ -333,21 +293,6 @@ def test_what_a_reader_forgets_is_named(
     assert "camera.json: principal point 24, 16 in" in problem
     assert not others
 
-    # Problems of files that only `data check` and `preprocess` find.
-    decibels = lambda *_: np.full(grid.projection_shape, 0.5, np.float32)  # noqa: E731
-    monkeypatch.setattr(toy.ToyFrame, "read_projection", decibels)
-    report = check_frames(_read_toy(root), classes, [str(root)])
-    first, second = report.to_dict()["summary"]["problems"]
-    assert first.startswith("1/0001: projection: all values are the same")
-    assert second.startswith("2/0001: ")
-    assert "2 problems" in report.to_text()
-    skipped = preprocess(_read_toy(root), tmp_path / "records").skipped
-    assert len(skipped) == 4
-    monkeypatch.setattr(toy.ToyFrame, "read_projection", lambda *_: np.ones((2, 3, 4)))
-    report = check_frames(_read_toy(root), classes, [str(root)], deep=True)
-    assert report.num_problems == 4
-    assert "projection of shape (2, 3, 4), not" in report.summary.problems[0][1]
-
 
 @pytest.mark.parametrize("is_flat", [False, True])
 def test_written_folders_are_read(
@@ -378,16 +323,10 @@ def test_written_folders_are_read(
     ("name", "value", "message"),
     [
         ("model.neck", "strip", "'strip', expected 'dilated' or 'plain' or module:Ob"),
-        ("model.neck", "parts:Strip", "module 'parts' has no attribute 'Strip'"),
-        ("model.neck", "no_module:Strip", "in the folder of no_module, or add"),
-        ("model.neck", "parts:WideHead", "expected the name of a Neck"),
         ("model.name", "parts:StripNeck", "expected the name of a RadeNet"),
-        ("model.exponents", 2.0, "exponents is not a field; did you mean .*exponent"),
-        ("model.exponent", "2", "exponent is '2', expected a number"),
         ("loss.own_terms", (), "for some of focal, gwd, smooth_l1, and"),
         ("evaluation.protocols", ("parts:PowerNet",), "the name of a Protocol"),
         ("data.format", "parts:PowerNet", "expected the name of a LabeledFrames"),
-        ("data.format", "json:Reader", "no attribute 'Reader'"),
         ("data.format", "nuscenes", "'nuscenes', expected 'kradar' or module:Object"),
     ],
 )

@@ -19,8 +19,6 @@ from radejax.config import load_config, load_module
 from radejax.core.errors import DataError, UserError
 from radejax.data.cameras import require_images
 from radejax.data.records import open_embeddings
-from radejax.inference.detector import Detector
-from radejax.inference.predict import predict_dataset
 from radejax.inference.saved import load_model
 from radejax.models import build
 from radejax.runs import experiment
@@ -236,33 +234,6 @@ def test_images_that_are_not_embedded_are_an_error(from_images, embeddings):
         require_images(gone, inputs)
 
 
-def test_frames_without_image_are_counted_and_predicted_by_radar(
-    data, from_images, caplog
-):
-    run, own = opened(from_images)
-    frames = list(own.split("test"))
-    detector = Detector(run, score_threshold=0.0)
-
-    def boxes(frames):
-        images = own.images(frames)
-        found = predict_dataset(detector, own.records, frames, 4, images=images)
-        return {i: found.box[found.frame == i] for i in range(len(frames))}
-
-    seen = boxes(frames)
-    blind = [dataclasses.replace(frames[0], camera_path=None), *frames[1:]]
-    with caplog.at_level(logging.WARNING):
-        half = boxes(blind)
-    assert "1 of 4 frames have no front image" in caplog.text
-    assert not np.array_equal(half[0], seen[0])
-    np.testing.assert_allclose(half[1], seen[1], rtol=1e-4, atol=1e-4)
-    radar = predict_dataset(detector, own.records, frames[:1], 4)
-    np.testing.assert_allclose(radar.box, half[0], rtol=1e-4, atol=1e-4)
-
-    own.camera = own.camera.replace(allow_missing=False)
-    with pytest.raises(UserError, match="1 of 4 frames"):
-        own.images(blind)
-
-
 def test_other_data_without_cameras_are_an_error(data, from_images, tmp_path):
     other = shutil.copytree(data.folder, tmp_path / "other")
     shutil.rmtree(other / "records")
@@ -282,14 +253,9 @@ def test_embeddings_that_do_not_fit_are_rejected(data, embeddings, tmp_path):
         changed = config.replace(data=paths).with_fields(fields)
         return Data(changed)
 
-    plain = config.with_fields({"model.image.standardize": False}).model.image
-    (tmp_path / "manifest.json").write_text('{"options": {"shape": [2, 3]}}')
     for call, message in (
-        (lambda: open_embeddings(embeddings, plain.to_dict()), "standardize is True"),
         (lambda: open_data({"data.mirror_probability": 0.5}), "cannot be mirrored"),
-        (lambda: open_data({"model.image.freeze": False}), "freeze=True"),
         (lambda: open_embeddings(tmp_path / "nothing"), "radejax embed"),
-        (lambda: open_embeddings(tmp_path), r"manifest\.json: corrupted"),
     ):
         with pytest.raises((UserError, DataError, FileNotFoundError), match=message):
             call()

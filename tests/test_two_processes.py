@@ -141,16 +141,6 @@ def _start_long(folder: pathlib.Path, run: str) -> list[subprocess.Popen]:
     return started
 
 
-@pytest.mark.parametrize("victim", [0, 1])
-def test_a_killed_process_ends_the_other(runs: pathlib.Path, victim: int) -> None:
-    started = _start_long(runs, f"killed{victim}")
-    started[victim].kill()
-    output = processes.outputs_of(started, timeout_s=30)[1 - victim]
-    assert started[1 - victim].returncode == 1
-    assert output.splitlines().count(processes.lost(victim)) == 1
-    assert "Traceback" not in output
-
-
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGUSR1", "SIGHUP"])
 def test_a_signal_to_one_process_stops_both_with_a_checkpoint(
     runs: pathlib.Path, name: str

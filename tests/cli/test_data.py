@@ -3,7 +3,6 @@
 import json
 import pathlib
 import zipfile
-from types import SimpleNamespace
 from typing import Any
 
 import click.testing
@@ -12,16 +11,11 @@ import pytest
 
 from radejax import Detector, KRadar, models
 from radejax.cli import figures, main
-from radejax.config import Config
 from radejax.core.errors import DataError, UserError
-from radejax.data.kradar.radar_files import find_frames
 from radejax.data.kradar.tesseract import read_tesseract
-from radejax.data.options import CameraOptions
 from radejax.data.records import Records
-from radejax.inference.detect_files import front_images
 from radejax.inference.export import export
 from radejax.inference.saved import SavedModel, save_model
-from radejax.models.options import DinoRadeOptions, ImageOptions
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
 
@@ -132,9 +126,6 @@ def test_boxes_are_found_in_files_and_arrays(
         detector([arrays[0] * 1e13])
     with pytest.raises(UserError, match="input is 'tensor', expected projection, as"):
         export(detector, tmp_path / "program", radar_input="tensor")
-    export(detector, tmp_path / "program", kind="huggingface")
-    card = (tmp_path / "program" / "README.md").read_text()
-    assert f"Projections of K-Radar's {release} files [B, 24, 16," in card
 
 
 @pytest.mark.parametrize("release", [None, "polar3d", "rpc"])
@@ -151,37 +142,6 @@ def test_a_detector_takes_the_form_that_it_was_trained_on(
         for frame in frames[form]:
             with pytest.raises(UserError, match="but the model is for"):
                 detector(frame)
-
-
-def test_images_on_another_disk_are_found(disks: Any) -> None:
-    _, roots, labels = disks
-    paths = find_frames(roots)
-    assert len(paths) == 12
-    detector: Any = SimpleNamespace(
-        model=models.build(DinoRadeOptions(image=ImageOptions(size=(180, 320)))),
-        camera_options=CameraOptions(),
-        saved=SimpleNamespace(config=Config()),
-    )
-    found = front_images(paths, detector, labels, roots=roots)
-    assert set(found) == set(paths)
-    for path, (image, camera) in found.items():
-        assert image.parents[1] == roots[1] / path.parent.name
-        assert camera.is_valid
-    assert not front_images(paths, detector, roots=roots[:1])
-
-
-def test_other_roots_are_wrong_use(
-    disks: Any, tensors: pathlib.Path, tmp_path: pathlib.Path
-) -> None:
-    release, roots, _ = disks
-    text = _run(
-        "preprocess", tensors, *roots, "--out", tmp_path / "records", code=2
-    ).output
-    assert text.startswith("error: ")
-    assert f"{release}_000" in text
-    assert text.endswith("name only roots of one form\n")
-    words = ("--to", "rpc", "--rate", "0", "--out", tmp_path / "out")
-    assert "rate is 0.0, expected" in _run("reduce", tensors, *words, code=2).output
 
 
 def test_points_of_two_disks(
@@ -208,16 +168,9 @@ def test_points_of_two_disks(
         # The elevation axis of simulated tensors points up.
         elevation_rad = grid.elevation_rad[found[:, 10].astype(int)]
         np.testing.assert_allclose(found[:, 2], found[:, 5] * np.sin(elevation_rad))
-    again = _run("points", radar, others, tensors, *words, code=2).output
-    assert again.startswith("error: ")
-    assert "would both be" in again
-    if release == "rpc":
-        assert "would both be" in _run("points", radar, "--out", radar, code=2).output
     words = ("--to", "pcd", "--method", "cfar", "--threshold-db", 3)
     _run("points", radar, others, *words, "--sequences", 1, "--out", tmp_path / "c")
     assert len(list((tmp_path / "c").glob("1/rpc_*.pcd"))) == 4
-    text = _run("points", radar, others, "--out", tmp_path / "c", code=2).output
-    assert "holds other points: options.method is 'cfar' there and 'percent" in text
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 import radejax
-from radejax.cli.figures import overlay, viewer_scenes
+from radejax.cli.figures import overlay
 from radejax.config import Config
 from radejax.core.structures import Boxes
 from radejax.data.kradar import KRadar
@@ -113,42 +113,6 @@ def test_boxes_that_cannot_be_drawn_on_the_image_are_reported(
     assert "1 of 1 frames have no front image, 0 no camera calib" in text
 
 
-def test_an_image_without_radar_data_is_drawn(
-    root: pathlib.Path, tmp_path: pathlib.Path, drawn: list[Figure]
-) -> None:
-    disk = pathlib.Path(shutil.copytree(root, tmp_path / "disk"))
-    (tensor,) = disk.glob("1/radar_tesseract/*")
-    tensor.unlink()
-    text = _run("1", disk, "--out", tmp_path / "a.png").output
-    assert text == f"drew {tmp_path / 'a.png'}; 1 of 1 frames have no radar data\n"
-    (figure,) = drawn
-    (image,) = (ax for ax in figure.axes if ax.images)
-    assert image.collections  # boxes
-    assert "no radar tensor" in _run("1", disk, "--slices", code=2).output
-    (path,) = disk.glob("1/cam-front/*")
-    path.unlink()
-    assert "no radar tensor" in _run("1", disk, code=2).output
-
-
-@pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        ((), "narrow region"),
-        (("--roi", "wide"), "wide region"),
-        (("--roi=none",), None),
-    ],
-)
-def test_the_region_is_that_of_the_evaluation_and_named(
-    arguments: tuple[str, ...],
-    expected: str | None,
-    root: pathlib.Path,
-    drawn: list[Figure],
-) -> None:
-    _run("1", root, *arguments)
-    texts = [text.get_text() for text in drawn[0].legends[0].get_texts()]
-    assert texts[1:] == ([expected] if expected else [])
-
-
 def test_detections_of_a_run_are_drawn_beside_the_labels(
     root: pathlib.Path, drawn: list[Figure], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -180,15 +144,6 @@ def test_detections_of_a_run_are_drawn_beside_the_labels(
     assert "--slices shows no detections" in error
     error = _run("1", root, "--score-threshold", 0.3, code=2).stderr
     assert "--score-threshold selects detections: give --workdir RUN" in error
-
-
-def test_frames_with_projections_only_are_shown(tmp_path: pathlib.Path) -> None:
-    options = ONE_FRAME.replace(output="projection")
-    root = simulate_dataset(options, tmp_path / "data", progress=False)
-    frames = KRadar([root], visibility=None)
-    (shown,) = viewer_scenes(frames, frames.grid)
-    stored = np.load(frames[0].projection_path)
-    np.testing.assert_allclose(shown.projection, np.moveaxis(stored, 0, -1))
 
 
 def test_lidar_points_are_drawn_in_the_radar_frame(

@@ -1,4 +1,3 @@
-import errno
 import io
 import zipfile
 
@@ -10,7 +9,6 @@ from radejax.core.archives import (
     read_npy,
     read_npz,
     read_safetensors,
-    wrap_read_errors,
 )
 from radejax.core.errors import DataError
 
@@ -91,18 +89,6 @@ def test_members_that_are_not_read(tmp_path):
     path.write_bytes(content)
     with zipfile.ZipFile(path) as archive, pytest.raises(DataError, match="encrypted"):
         read_member(archive, "bomb", max_bytes=1 << 20)
-
-
-def test_errors_of_the_file_system_are_not_corruption(tmp_path):
-    with pytest.raises(FileNotFoundError):
-        read_npy(tmp_path / "none.npy")
-    with pytest.raises(IsADirectoryError):
-        read_npz(tmp_path)
-    with (
-        pytest.raises(OSError, match=r"Input/output error: 'a\.mat'"),
-        wrap_read_errors("a.mat", "a MATLAB file"),
-    ):
-        raise OSError(errno.EIO, "Input/output error")
 
 
 def test_a_pointer_in_place_of_weights(tmp_path):

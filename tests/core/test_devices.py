@@ -3,12 +3,7 @@
 import os
 import signal
 
-import chex
-import jax
-import jax.numpy as jnp
-import numpy as np
 import pytest
-from jax.sharding import PartitionSpec
 
 from radejax.core import devices
 
@@ -109,25 +104,3 @@ def test_under_nohup_a_closed_terminal_is_ignored():
         assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)
-
-
-def test_put_batch_splits_the_leading_axis():
-    mesh = devices.make_mesh(4)
-    batch = {"x": np.arange(24.0).reshape(8, 3), "i": np.arange(8)}
-    placed = devices.put_batch(batch, mesh)
-    chex.assert_trees_all_equal(placed, batch)
-    assert [s.data.shape for s in placed["x"].addressable_shards] == [(2, 3)] * 4
-
-
-def test_fsdp_splits_the_widest_axis_that_divides():
-    mesh = devices.make_mesh(4)
-    state = {
-        "kernel": jax.ShapeDtypeStruct((3, 3, 128, 256), jnp.float32),
-        "bias": jax.ShapeDtypeStruct((256,), jnp.float32),
-        "odd": jax.ShapeDtypeStruct((333, 333), jnp.float32),
-    }
-    placed = devices.state_sharding(state, mesh, "fsdp")
-    assert placed["kernel"].spec == PartitionSpec(None, None, None, "data")
-    assert placed["bias"].spec == placed["odd"].spec == PartitionSpec()
-    whole = devices.state_sharding(state, mesh, "replicated")
-    assert {s.spec for s in whole.values()} == {PartitionSpec()}

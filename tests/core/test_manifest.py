@@ -1,6 +1,5 @@
 """Descriptions of output folders."""
 
-import json
 import os
 
 import pytest
@@ -81,20 +80,6 @@ def test_a_folder_in_which_nothing_was_written_may_get_other_options(tmp_path):
         claim("points", 2)
 
 
-def test_another_job_in_the_folder_is_an_error(tmp_path):
-    Manifest.claim(tmp_path, "boxes", {"step": 1}, ["a"])
-    content = json.loads((tmp_path / "manifest.json").read_text())
-    content["radejax"] = "0.1.0"  # another version may continue
-    (tmp_path / "manifest.json").write_text(json.dumps(content))
-    Manifest.claim(tmp_path, "boxes", {"step": 1}, ["a"])
-    message = "other boxes: options.step is 1 there and 2 here"
-    with pytest.raises(UserError, match=message):
-        Manifest.claim(tmp_path, "boxes", {"step": 2}, ["a"])
-    message = r"names is \['a'\] there and \['a', 'b'\] here"
-    with pytest.raises(UserError, match=message):
-        Manifest.claim(tmp_path, "boxes", {"step": 1}, ["a", "b"])
-
-
 def test_files_that_are_not_those_of_a_description_are_rejected(tmp_path):
     for name in ("a", "b"):
         (tmp_path / name).write_text(name)
@@ -111,9 +96,3 @@ def test_files_that_are_not_those_of_a_description_are_rejected(tmp_path):
         DataError, match="/b is corrupted or of another folder: its sha"
     ):
         read_checked(path)
-    for wrong in (5, [1], None, "text"):
-        files.write_json(path, {"sha256": wrong})
-        with pytest.raises(
-            DataError, match=r"report\.json: corrupted, not a description"
-        ):
-            read_checked(path)

@@ -67,14 +67,10 @@ def test_changes_are_of_fields_of_sections_or_of_whole_sections():
     ("fields", "message"),
     [
         ({"count": True}, "count is True, expected an integer"),
-        ({"seed": -1}, "seed is -1, expected an integer of at least 0"),
-        ({"decay": float("nan")}, "decay is nan, expected a"),
         ({"weights.x": 0.0}, "weights.x is 0.0, expected a number above 0"),
         ({"part.rate": 2}, "part.rate is 2, expected a number of at most 1"),
         ({"part.sizes": [1, 0]}, "part.sizes[1] is 0, expected an integer of at least"),
         ({"part.kind": "c"}, "part.kind is 'c', expected 'a' or 'b'"),
-        ({"part.region": 5}, "part.region is 5, expected 'wide'"),
-        ({"part.mixed": ("x",)}, "part.mixed[0] is 'x', expected an integer"),
         ({"part.rat": 1}, "part.rat is not a field; did you mean config.part.rate?"),
         ({"seeed": 1}, "seeed is not a field; did you mean config.seed?"),
     ],
@@ -101,9 +97,7 @@ def test_parts_are_known_or_imported_and_of_one_kind():
     assert found is pathlib.Path
     assert find_part("math:pi", "config.x", {}, float) > 3
     for name, message in (
-        ("floats:", r"is 'floats:', expected 'floats' or module:Object"),
         (":Path", r"is ':Path', expected 'floats' or module:Object"),
-        (None, r"is None, expected 'floats' or module:Object"),
         ("pathlib:Paths", "no attribute 'Paths'; run this in the folder of pathlib"),
         ("no.such:Thing", "No module named 'no'"),
         ("pathlib:Path", "is 'pathlib:Path', expected the name of a float"),

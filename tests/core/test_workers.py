@@ -34,36 +34,6 @@ def test_a_worker_is_started_once_survives_ctrl_c_and_errors_and_ends(tmp_path):
     assert not is_running(pid)
 
 
-def test_workers_that_start_later_leave_ctrl_c_alone_too():
-    """An idle worker takes several tasks, so a pool may start others long after its first."""
-    state = (
-        "__import__('time').sleep(0.1), __import__('os').getpid(), "
-        "__import__('signal').pthread_sigmask(0, [])"
-    )
-    with process_pool(3) as submit:
-        masks = {submit(os.getpid).result(): {signal.SIGINT}}
-        while len(masks) < 3:
-            started = [submit(eval, state) for _ in range(3)]
-            masks |= {pid: mask for _, pid, mask in (one.result() for one in started)}
-    assert all(signal.SIGINT in mask for mask in masks.values())
-
-
-def test_ctrl_c_is_blocked_while_a_worker_imports_its_modules(tmp_path):
-    """Otherwise, workers that are starting end with a traceback each."""
-    script = tmp_path / "script.py"
-    script.write_text(
-        "import signal\n"
-        "from radejax.core.workers import process_pool\n"
-        'if __name__ == "__mp_main__":\n'
-        "    print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, []))\n"
-        'if __name__ == "__main__":\n'
-        "    with process_pool(1) as submit:\n"
-        "        submit(print, 'started').result()\n"
-    )
-    done = subprocess.run([sys.executable, script], capture_output=True, text=True)
-    assert done.stdout == "True\nstarted\n"
-
-
 def test_an_error_beside_the_work_ends_the_workers(tmp_path):
     waiting = []
 
@@ -126,36 +96,18 @@ CONTAINER = {
     "proc/self/cgroup": "2:memory:/job\n0::/job/step\n",
     "groups/job/step/cpu.max": "max 100000\n",
 }
-CPUS_OF_VERSION_1 = {
-    "proc/self/cgroup": "7:cpu,cpuacct:/docker/1a\n2:memory:/docker/1a\n",
-    "groups/cpu/cpu.cfs_period_us": "100000\n",
-}
 MEMORY = {"proc/meminfo": "MemTotal:  9000000 kB\nMemAvailable:  7200000 kB\n"}
-MEMORY_OF_VERSION_1 = MEMORY | {
-    "proc/self/cgroup": "2:memory:/job\n",
-    "groups/memory/memory.limit_in_bytes": "9223372036854771712\n",
-}
 MEMORY_OF_VERSION_2 = MEMORY | {"proc/self/cgroup": "0::/job\n"}
-LIMIT = "groups/memory/job/memory.limit_in_bytes"
 
 
 @pytest.mark.parametrize(
     ("texts", "num_cpus", "num_workers"),
     [
         ({}, 64, 64),
-        ({"proc/self/cgroup": "0::/\n3:cpu,cpuacct:/\n"}, 64, 64),
-        (CONTAINER, 64, 64),
         # A limit in the group of the process or in one above it, of either version.
         (CONTAINER | {"groups/job/cpu.max": "300000 100000\n"}, 3, 3),
-        (CONTAINER | {"groups/job/cpu.max": "150000 100000\n"}, 2, 2),
-        (CONTAINER | {"groups/job/cpu.max": "1000 100000\n"}, 1, 1),
-        (CPUS_OF_VERSION_1 | {"groups/cpu/cpu.cfs_quota_us": "-1\n"}, 64, 64),
-        (CPUS_OF_VERSION_1 | {"groups/cpu/cpu.cfs_quota_us": "150000\n"}, 2, 2),
         # Each worker needs 450 MB of a half of the memory.
         (MEMORY, 64, 8),
-        (MEMORY_OF_VERSION_1, 64, 8),
-        (MEMORY_OF_VERSION_1 | {LIMIT: "2000000000\n"}, 64, 2),
-        (MEMORY_OF_VERSION_2 | {"groups/job/memory.max": "max\n"}, 64, 8),
         (MEMORY_OF_VERSION_2 | {"groups/job/memory.max": "100000000\n"}, 64, 1),
     ],
 )

@@ -196,34 +196,6 @@ def test_files_of_all_layouts_are_read(
         )
 
 
-def test_the_page_is_run_on_a_file(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    page = pathlib.Path(__file__).resolve().parents[2] / "docs" / "adc.md"
-    text = page.read_text("utf-8")
-    code, calibrate = re.findall(r"^```python\n(.*?)^```", text, re.M | re.S)
-    monkeypatch.chdir(tmp_path)
-    words = np.random.default_rng(0).integers(-9, 9, 128 * 2 * 4 * 128 * 2)
-    words.astype("<i2").tofile("adc_data.bin")
-    names: dict[str, np.ndarray] = {}
-    exec(code, names)
-    assert names["projection"].shape == (128, 48, 128)
-    assert np.isfinite(names["projection"]).all()
-    # Channels with errors of gain and phase, and a reflector straight ahead.
-    radar, rng = names["radar"], np.random.default_rng(0)
-    errors = rng.uniform(0.5, 1.5, (2, 4, 1)) * np.exp(
-        2j * rng.uniform(-1, 1, (2, 4, 1))
-    )
-    echo = 100.0 * errors * np.exp(2j * np.pi * 0.15 * np.arange(128))
-    names["samples"] = np.broadcast_to(echo, radar.shape).astype(np.complex64)
-    exec(calibrate, names)
-    beams = names["power"].max((0, 1, 2))
-    expected = adc_to_power(names["samples"] / errors, radar).max((0, 1, 2))
-    np.testing.assert_allclose(
-        beams / beams.max(), expected / expected.max(), atol=1e-3
-    )
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -233,15 +205,9 @@ def test_the_page_is_run_on_a_file(
         ),
         ({"rx_m": [(0.0, 0.0)]}, r"radar.rx_m\[0\] is missing"),
         (
-            {"azimuth_rad": [-0.5, 0.5, 0.0]},
-            "azimuth_rad must be increasing or decreasing, got 0.5 before 0$",
-        ),
-        (
             {"azimuth_rad": np.arange(-50.0, 51.0)},
             "azimuth_rad must be finite, to 3.14159 radians .* got values from -50 to 50",
         ),
-        ({"elevation_rad": [0, 10.0]}, "elevation_rad must be finite, to 3.14159 rad"),
-        ({"azimuth_rad": ()}, "azimuth_rad must be a vector of at least 2 bins"),
         (
             {"carrier_hz": 77.0},
             "radar.carrier_hz is 77.0, expected a number of at least 1000000000",
@@ -251,15 +217,9 @@ def test_the_page_is_run_on_a_file(
             "radar.slope_hz_per_s is 30.0, expected Hz per second .30 MHz/us are 30e12",
         ),
         (
-            {"chirp_period_s": 20.0},
-            "radar.chirp_period_s is 20.0, expected a number of at most 0.1",
-        ),
-        (
             {"sample_rate_hz": 10_000.0},
             "radar.sample_rate_hz is 10000.0, expected at least 3.2e",
         ),
-        ({"max_range_m": 0.1}, "range_m must be a vector of at least 2"),
-        ({"num_chirps": 1}, "radar.num_chirps is 1, expected an integer of at least 2"),
     ],
 )
 def test_wrong_radars_are_named(change, message):
@@ -274,10 +234,6 @@ def test_wrong_radars_are_named(change, message):
         (
             np.zeros((16, 2, 4, 64), complex),
             "shape of samples is (16, 2, 4, 64), expected (16, 3, 4, 64): num_chirps",
-        ),
-        (
-            np.zeros((64, 16, 3, 4), complex),
-            r"shape of samples is (64, 16, 3, 4), expected",
         ),
         (
             np.zeros((16, 3, 4, 64), np.int16),
@@ -308,11 +264,8 @@ REAL = RADAR.replace(is_complex=False)
             np.where(np.arange(16)[:, None, None, None] == 3, np.nan, SAMPLES),
             "number of samples that are not finite is 768, expected 0",
         ),
-        (REAL, np.where(COUNTS[0] > 298, np.inf, 1.0), "that are not finite is"),
         (RADAR, 0 * SAMPLES, "all samples are 0: check"),
-        (REAL, 0 * COUNTS[0], "all samples are 0: check"),
         (REAL, WRAPPED[0], "samples are unsigned, from 0 to 65535, exp"),
-        (REAL, WRAPPED[0].astype(float), "unsigned, from 0 to 65535, "),
         (RADAR, WRAPPED[0] + 1j * WRAPPED[1], "unsigned, from 0 to 65535, "),
         (REAL, (COUNTS[0] + 2048).astype(np.uint16), "subtract the middle, such as"),
     ],
@@ -320,14 +273,6 @@ REAL = RADAR.replace(is_complex=False)
 def test_samples_that_no_adc_records_are_named(radar, samples, message):
     with pytest.raises(UserError, match=message):
         adc_to_power(samples, radar)
-
-
-def test_the_advice_on_unsigned_samples_restores_them():
-    floats = WRAPPED.astype(float)
-    real, imag = (x.astype(np.uint16).view(np.int16) for x in floats)
-    np.testing.assert_array_equal(real + 1j * imag, SAMPLES)
-    large = 40000.0 + COUNTS[0] + 0.5  # not counts
-    assert np.isfinite(power_of(REAL, large)).all()
 
 
 @pytest.mark.parametrize("shape", [(2, 3), (12,), (3, 1)])

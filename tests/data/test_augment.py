@@ -1,5 +1,4 @@
 import dataclasses
-import re
 
 import numpy as np
 import pytest
@@ -143,19 +142,6 @@ def test_augmentation_is_a_function_of_its_seed():
     assert set(outcomes) == {3.0, -3.0}
     assert 10 <= outcomes[3.0] <= 30
     np.testing.assert_array_equal(before.boxes[0, 1], 3.0)
-
-
-def test_an_augmentation_that_returns_nothing_is_named():
-    def forgetful(sample, rng):
-        pass
-
-    before = sample(np.zeros((1, 8)))
-    augment = Augmentation(GRID, others=[forgetful])
-    message = (
-        "of forgetful in config.data.augmentation is 'NoneType', expected a Sample"
-    )
-    with pytest.raises(UserError, match=re.escape(message)):
-        augment(before, np.random.default_rng(0))
 
 
 def test_padding_stays_zero_and_off_is_off():

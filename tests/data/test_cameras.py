@@ -159,14 +159,6 @@ def test_a_calibration_of_images_of_another_shape_is_named(tmp_path):
         read_left_image(path, (18, 32), **sizes)
 
 
-def test_gray_levels_of_16_bits_are_divided_by_256(tmp_path):
-    levels = (np.arange(64 * 32).reshape(32, 64) * 32).astype(np.uint16)
-    Image.fromarray(levels).save(tmp_path / "a.png")
-    found = read_left_image(tmp_path / "a.png", (32, 64))
-    np.testing.assert_array_equal(found, np.repeat(levels[..., None] >> 8, 3, -1))
-    assert len(np.unique(found)) == 256
-
-
 @pytest.mark.parametrize("is_pair", [False, True])
 def test_the_size_of_the_calibration_tells_pairs_from_wide_images(tmp_path, is_pair):
     lens = np.array([600.0, 600.0, 704.0, 188.0])

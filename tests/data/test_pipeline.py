@@ -1,17 +1,14 @@
 import dataclasses
 import functools
 import itertools
-import shutil
 import types
 
 import chex
-import grain
 import numpy as np
-import orbax.checkpoint as ocp
 import pytest
 from PIL import Image
 
-from radejax.core.errors import DataError, UserError
+from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES, Batch
 from radejax.data.augment import Augmentation
 from radejax.data.cameras import CameraOptions, camera_inputs
@@ -238,22 +235,6 @@ def test_restored_in_mid_epoch_continues_with_the_next_batch(loader, data, step)
             chex.assert_trees_all_equal(a, b)
 
 
-def test_state_travels_with_an_orbax_checkpoint(loader, tmp_path):
-    first = loader(num_epochs=2)
-    for _ in range(5):
-        next(first)
-    with ocp.CheckpointManager(tmp_path) as manager:
-        manager.save(
-            5, args=ocp.args.Composite(data=grain.checkpoint.CheckpointSave(first))
-        )
-        manager.wait_until_finished()
-        second = loader(num_epochs=2)
-        manager.restore(
-            5, args=ocp.args.Composite(data=grain.checkpoint.CheckpointRestore(second))
-        )
-    assert frames_of(second) == frames_of(first)
-
-
 # Options ------------------------------------------------------------------------------
 
 
@@ -303,19 +284,6 @@ def test_images_and_cameras(records, data, tmp_path):
     assert batch.camera.is_valid.tolist() == [True, True, False, True]
     chex.assert_shape(batch.camera.cam_from_ego, (4, 3, 4))
     assert batch.camera.intrinsics.dtype == np.float32
-
-
-def test_a_corrupted_record_is_named_when_it_is_read(records, data, tmp_path):
-    copy = open_projections(shutil.copytree(records.folder, tmp_path / "copy"))
-    path = copy.path(data[4].key)
-    path.write_bytes(path.read_bytes()[:-1])
-    corrupted = make_loader(
-        make_table(copy, data, max_objects=5),
-        dataclasses.replace(OPTIONS, shuffle=False, num_threads=2),
-    )
-    next(corrupted)
-    with pytest.raises(DataError, match=rf"{data[4].key}\.npy: corrupted"):
-        next(corrupted)
 
 
 # Tables ------------------------------------------------------------------------------

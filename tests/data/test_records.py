@@ -1,16 +1,11 @@
 """Records: one file per frame, resumable, sharded, never half written."""
 
-import concurrent.futures
-import dataclasses
-import errno
 import json
-import multiprocessing
 import os
 import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 
 import numpy as np
@@ -80,20 +75,6 @@ def test_every_frame_is_its_projection(data, folder):
         records["1/none"]
 
 
-def test_threads_read_at_the_same_time(tmp_path):
-    """NumPy's parser of headers fails now and then in threads of Python 3.11.7."""
-    np.save(tmp_path / "1.npy", np.ones((4, 2), np.float16))
-    records = Records(tmp_path, (4, 2), "float16", {})
-    interval_s = sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)
-    try:
-        with concurrent.futures.ThreadPoolExecutor(8) as pool:
-            found = list(pool.map(records.__getitem__, ["1"] * 4000))
-    finally:
-        sys.setswitchinterval(interval_s)
-    assert all((array == 1).all() for array in found)
-
-
 def test_corrupted_records_are_named(data, copy):
     records, key = open_projections(copy), data[4].key
     path = records.path(key)
@@ -115,10 +96,7 @@ def test_corrupted_records_are_named(data, copy):
     ("change", "message"),
     [
         ({"dtype": "int4"}, "dtype is 'int4'"),
-        ({"shape": None}, "corrupted"),
         ({"source": 3}, "corrupted"),
-        ({"source": {}}, r"not the records of a radar"),
-        ({"source": {"grid": {}}}, "not the records of a radar"),
         ({"shape": [2, 3, 4]}, "arrays of shape"),
     ],
 )
@@ -228,24 +206,6 @@ def test_an_interrupt_of_all_processes_is_one_line(root, tmp_path):
     assert "Traceback" not in errors
 
 
-def test_a_killed_worker_is_one_line(root, tmp_path):
-    blocked = root / "1/radar_tesseract/tesseract_00005.mat"
-    blocked.unlink()
-    os.mkfifo(blocked)
-    out = tmp_path / "out"
-
-    def kill_workers() -> None:
-        wait_until(lambda: list(out.rglob("*.npy")))
-        for process in multiprocessing.active_children():
-            process.kill()
-
-    killer = threading.Thread(target=kill_workers)
-    killer.start()
-    with pytest.raises(UserError, match=r"a worker process .*run the same"):
-        run(KRadar(root), out, num_workers=1)
-    killer.join()
-
-
 def test_bad_frames_are_skipped_counted_and_tried_again(root, tmp_path):
     bad = root / "1/radar_tesseract/tesseract_00005.mat"
     content = bad.read_bytes()
@@ -257,10 +217,6 @@ def test_bad_frames_are_skipped_counted_and_tried_again(root, tmp_path):
     assert list(report.skipped) == ["1/00005_00002", "2/00009_00006"]
     assert "skipped 2/00009_00006: no radar tensor in any root" in report.to_text()
     assert "skipped 1/00005_00002: " in report.to_text()
-    many = dataclasses.replace(
-        report, skipped=dict.fromkeys("abcdefghijklmnopqrstuvwxyz", "")
-    )
-    assert "... and 6 more skipped" in many.to_text()
     with pytest.raises(
         UserError, match=r"2 of 12 .* is 1/00005_00002: run `radejax pr"
     ):
@@ -336,35 +292,16 @@ def test_a_folder_has_records_of_one_kind(data, tmp_path):
         (lambda data, _: run(LabeledFrames([], data.grid), "x"), "no frames to preproc"),
         (lambda data, _: run(data, "x", dtype="int4"), "dtype is 'int4', expected one of"),
         (lambda data, _: run(data, "x", shard=(2, 2)), "i from 0 to n - 1"),
-        (lambda data, _: run(data, "x", shard=(-1, 2)), "i from 0 to n - 1"),
         (
             lambda _, folder: open_projections(folder, RadarGrid.kradar()),
             r"6 x 16 x 5 x 12 bins.*expected 64 x 256 x 37",
         ),
-        (lambda data, folder: open_projections(folder, far(data.grid)), r"to 129\.80 m"),
         (lambda _, folder: open_embeddings(folder), "not embeddings of images"),
     ],
 )  # fmt: skip
 def test_wrong_arguments(data, folder, call, message):
     with pytest.raises((DataError, UserError), match=message):
         call(data, folder)
-
-
-def far(grid):
-    return dataclasses.replace(grid, range_m=grid.range_m * 1.1)
-
-
-def test_a_full_disk_keeps_nothing_half_written(data, tmp_path, monkeypatch):
-    def full(file, array, **_):
-        file.write(b"half")
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(np, "save", full)
-    with pytest.raises((OSError, UserError), match=r"(?i)no space left"):
-        run(data, tmp_path)
-    assert list(contents(tmp_path)) == ["manifest.json"]
-    assert Records.open(tmp_path).keys() == set()
-    assert Records.open(tmp_path).dtype == "float16"
 
 
 def test_uneven_axes_are_kept_and_told_apart(tmp_path):
@@ -381,9 +318,3 @@ def test_uneven_axes_are_kept_and_told_apart(tmp_path):
         match=r"of 4 x 16 x 0 x 14 bins.*, not uniform, expected .* deg: .*--records",
     ):
         open_projections(tmp_path, even)
-    np.save(tmp_path / "1.npy", np.zeros(1))
-    source = {"grid": even.to_dict()}
-    with pytest.raises(
-        UserError, match=r"choose another folder .--records, or --out.,"
-    ):
-        Records.create(tmp_path, even.projection_shape, "float16", source)

@@ -346,25 +346,6 @@ def test_detections_of_the_released_code(case):
     np.testing.assert_array_equal(found.num_truncated, 0)
 
 
-def test_thresholds_and_region_are_traced_values():
-    logits, params, _, _ = scattered(num=10)
-    count = _decode._cache_size()
-    for threshold, nms_iou in ((0.3, 0.3), (0.8, 0.5)):
-        roi = np.array([0.0, 100 * threshold, -50, 50, -1, 1])
-        values = {"score_threshold": threshold, "nms_iou": nms_iou, "roi": roi}
-        found = jax.device_get(
-            _decode(maps_of(logits, params), GRID, RELEASED, **values)
-        )
-        valid = found.is_valid[0]
-        assert (found.scores[0][valid] > threshold).all()
-        assert (found.boxes[0][valid, 0] <= 100 * threshold).all()
-        # The options give the same as constants.
-        options = RELEASED.replace(**values | {"roi": tuple(map(float, roi))})
-        same = jax.device_get(_decode(maps_of(logits, params), GRID, options))
-        jax.tree.map(np.testing.assert_array_equal, found, same)
-    assert _decode._cache_size() == count + 3
-
-
 def test_bfloat16_maps_and_saturated_or_missing_numbers():
     logits, params, _, _ = scattered()
     low = jax.tree.map(lambda x: x.astype(jnp.bfloat16), maps_of(logits, params))

@@ -2,8 +2,6 @@
 
 import html.parser
 import re
-import shutil
-import subprocess
 
 import numpy as np
 import pytest
@@ -82,36 +80,3 @@ def test_scenes_without_space_are_counted(written, tmp_path, monkeypatch):
     text = (tmp_path / "a.html").read_text()
     assert len(_Elements(text).of("img")) == 1
     assert "2 more are only in the folder" in text
-
-
-@pytest.mark.slow
-def test_a_browser_sorts_tables_and_selects_scenes(written, tmp_path):
-    names = ("chromium", "chromium-browser", "google-chrome")
-    browser = next(filter(None, map(shutil.which, names)), None)
-    if browser is None:
-        pytest.skip(f"no browser: none of {', '.join(names)}")
-    action = """<script>
-const select = document.querySelector("select");
-select.value = "rain";
-select.onchange();
-document.querySelectorAll("#one th")[1].onclick();
-document.title = [...document.images].every(x => x.complete && x.naturalWidth);
-</script>"""
-    copied = tmp_path / "used.html"
-    copied.write_text(written.read_text() + action)
-    options = ["--headless", "--no-sandbox", "--disable-gpu", "--dump-dom"]
-    done = subprocess.run(
-        [browser, *options, f"--user-data-dir={tmp_path / 'profile'}", copied.as_uri()],
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.returncode == 0, done.stderr
-    elements = _Elements(done.stdout)
-    assert len(elements.of("option")) == 3
-    shown = [x for x in elements.of("figure") if "hidden" not in x and "data-tags" in x]
-    assert [x["data-tags"] for x in shown] == ['{"weather": ["rain"]}']
-    assert '<span id="shown">1</span>' in done.stdout
-    first = done.stdout.split("<table>")[1].split("</table>")[0]
-    assert re.findall("<td>([abc])</td>", first) == ["c", "a", "b"]
-    assert "<title>true</title>" in done.stdout

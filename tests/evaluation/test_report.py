@@ -183,37 +183,3 @@ def test_score_thresholds_are_not_chosen_on_a_test_split(scene, tmp_path):
         assert row["count"] == round(row["recall"] * here.num_gt) > 0
         assert row["num_gt"] == here.num_gt
     assert len(chosen) == 2
-
-
-def test_curves_are_drawn_of_classes_that_occur(scene, tmp_path, monkeypatch):
-    from radejax.visualize import curves, style
-
-    drawn = []
-
-    def draw(panels, title, *_):
-        drawn.append((panels, title))
-        return style.new_figure(1, 1)
-
-    monkeypatch.setattr(curves, "draw_precision_recall", draw)
-    monkeypatch.setattr(style, "save_figure", lambda *_: None)
-    report.write_report(*scene, tmp_path, OPTIONS.replace(plots=True))
-    panels, title = drawn[0]
-    assert title == "all_point, 3D, IoU 0.3"
-    assert list(panels) == ["Total", "Normal", "Fog", "Rain"]
-    data = EvaluationSet(*scene[:2], frames=scene[2])
-    whole = data.results("all_point", iou_thresholds=0.3, spaces="3d")[0]
-    label = f"Sedan: AP {whole.ap:.1f}, {whole.num_gt} objects"
-    np.testing.assert_array_equal(panels["Total"][label][0], whole.recall)
-    (absent,) = (x for name, x in panels["Total"].items() if "Bicycle" in name)
-    assert absent is None
-
-
-def test_bins_of_a_reliability_diagram_have_their_number_of_predictions(scene):
-    data = EvaluationSet(*scene[:2], frames=scene[2])
-    figure = report._draw_scores(data, [], OPTIONS)["reliability"]
-    assert len(figure.axes) == 2
-    for ax in figure.axes:
-        index = data.classes.index(ax.get_title())
-        counts = [int(text.get_text()) for text in ax.texts]
-        assert len(counts) > 5
-        assert sum(counts) == (data.pred.cls == index).sum()

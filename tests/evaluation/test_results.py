@@ -137,22 +137,6 @@ def test_excluded_boxes_and_frames_are_counted(scene):
     assert "predictions: score not above 0.3 (counted by all_point)" in counts
 
 
-def test_dropped_predictions_and_classes_without_objects_are_counted(scene):
-    truth, found, frames = scene
-    names = np.where(np.arange(len(found["cls"])) < 3, "Bicycle", found["cls"])
-    found = read_boxes({**found, "cls": names}, "predictions", scored=True)
-    parts = [
-        dataclasses.replace(found.take(np.array([i])), num_truncated=i)
-        for i in (0, 1, 2)
-    ]
-    found = Boxes.concatenate([*parts, found])
-    options = ReportOptions(roi=None)
-    counts = exclusion_counts(make_set(truth, found, frames, options), options)
-    assert counts["predictions: dropped at max_detections, as far as known"] == 3
-    what = "predictions: of classes without ground truth, which have no AP"
-    assert counts[what] == 6
-
-
 def test_folders_are_named_after_options_that_change_numbers():
     usual = {"roi": "narrow", "split": "test"}
     changes = {"roi": "narrow", "bootstrap": 5, "kitti": True, "figures": "pdf"}
@@ -169,3 +153,19 @@ def test_conditions_are_in_the_papers_order():
     assert list(masks) == ["normal", "fog", "sleet", "martian"]
     assert masks["fog"].tolist() == [False, False, False, True]
     assert condition_masks(frames, "time") == {}
+
+
+def test_dropped_predictions_and_classes_without_objects_are_counted(scene):
+    truth, found, frames = scene
+    names = np.where(np.arange(len(found["cls"])) < 3, "Bicycle", found["cls"])
+    found = read_boxes({**found, "cls": names}, "predictions", scored=True)
+    parts = [
+        dataclasses.replace(found.take(np.array([i])), num_truncated=i)
+        for i in (0, 1, 2)
+    ]
+    found = Boxes.concatenate([*parts, found])
+    options = ReportOptions(roi=None)
+    counts = exclusion_counts(make_set(truth, found, frames, options), options)
+    assert counts["predictions: dropped at max_detections, as far as known"] == 3
+    what = "predictions: of classes without ground truth, which have no AP"
+    assert counts[what] == 6

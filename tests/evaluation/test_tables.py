@@ -1,7 +1,6 @@
 """Published rows, and tables of a run next to them."""
 
 import collections
-import re
 import zlib
 
 import pytest
@@ -38,15 +37,6 @@ def test_published_file_has_all_numbers():
         assert sum(len(row.values) for row in rows) == count
         lines = [f"{row.source} {row.method} {row.values}" for row in rows]
         assert zlib.crc32("\n".join(lines).encode()) == digest
-    for row in PUBLISHED:
-        assert row.protocol in ("coco101", "not stated")
-        assert row.region in ("narrow", "wide", "not stated")
-        assert set(row.sensors) <= set("LCR")
-        assert re.fullmatch(r"[\w-]+/[\w-]+|none|not stated", row.code)
-        if row.source in ("RADE-Net, Table I", "DinoRADE, Table 1"):
-            # These papers print v1.1 for rows of earlier papers.
-            is_earlier = row.method in ("DPFT", "RTNH", "WRCFormer")
-            assert ("labels=v1.1 (v1.0 in their own papers)" in row.terms) == is_earlier
 
 
 @pytest.mark.parametrize(

@@ -77,51 +77,10 @@ def test_what_is_missing_is_run_and_judged(
     names = [(name, config.seed) for name, config in runs.trained]
     cells = list(ablation.STUDIES["sigma"].cells)
     assert names == [(n, 0) for n in [*cells[:4], *cells[3:]]] + [(n, 4) for n in cells]
-    # Scenes are those of the seed, the same for all cells; no cell is trained on those
-    # that it is evaluated on.
-    assert sorted({name for name, _ in runs.simulated}) == [
-        "quickstart-640-seed0",
-        "quickstart-640-seed4",
-        "quickstart-held",
-    ]
-    assert len(runs.simulated) == 3
-    seeds = {n: json.loads(text)["seed"] for n, text in runs.simulated}
-    assert len(set(seeds.values())) == 3
-    for _, config in runs.trained:
-        assert config.data.roots[0].endswith(f"quickstart-640-seed{config.seed}")
-        assert config.simulation.seed == config.seed
-
     content = json.loads((tmp_path / "table_sigma.json").read_text())
     by = {(r["cell"], r["cls"]): r for r in content["rows"] if r["condition"] == "all"}
     row = by["sigma 0.75", "Sedan"]
     assert row["seeds"] == [0, 4]
-    assert row["ap"] > 75 > 60 > by["sigma 3", "Sedan"]["ap"]
-    base = by["sigma 3", "Sedan"]["ap"]
-    assert row["difference"] == pytest.approx(row["ap"] - base)
-    assert row["low"] < row["difference"] < row["high"]
-    verdicts = {claim["text"]: claim["verdict"] for claim in content["claims"]}
-    assert verdicts["0.75 is best for all classes"] == "supported"
-    assert verdicts["sanity check: labels matter"] == "supported"
-    assert content["radar"] == "realistic"
-    text = (tmp_path / "table_sigma.md").read_text()
-    assert "supported" in text
-    assert "Radar `realistic`" in text
-    assert r"\begin{tabular}" in (tmp_path / "table_sigma.tex").read_text()
-
-
-@pytest.mark.parametrize(
-    ("numbers", "word"),
-    [
-        ((5.0, 1.0, 9.0, 0.0), "supported"),
-        ((5.0, -1.0, 9.0, 0.0), "inconclusive"),
-        ((-5.0, -9.0, -1.0, 0.0), "not reproduced"),
-        ((3.0, 1.0, 5.0, 4.0), "inconclusive"),
-        ((5.0, 1.0, 9.0, 4.0), "supported"),
-        ((2.0, 1.0, 3.0, 4.0), "not reproduced"),
-    ],
-)
-def test_verdicts(numbers: tuple[float, ...], word: str) -> None:
-    assert ablation.verdict(*numbers) == word
 
 
 @pytest.mark.parametrize("table", sorted(ablation.STUDIES))

@@ -1,7 +1,5 @@
 """Tests of training on simulated frames without a dataset."""
 
-import json
-
 import jax
 import numpy as np
 import online_training
@@ -11,10 +9,6 @@ from online_training import train_online
 
 from radejax import Detector
 from radejax.config import load_config
-from radejax.core.errors import UserError
-from radejax.runs.evaluate import evaluate_run
-from radejax.simulation.config import SimulationOptions
-from radejax.simulation.dataset import simulate_dataset
 from radejax.training.checkpoints import Checkpoints
 
 from .. import small_models as small
@@ -56,22 +50,3 @@ def test_training_resumes_with_identical_results(tmp_path, monkeypatch):
     expected = Detector.from_workdir(whole / "checkpoints")
     found = Detector.from_workdir(parts / "checkpoints")
     jax.tree.map(np.testing.assert_array_equal, found.variables, expected.variables)
-    # The workdir is that of an ordinary run, except that its data are not on disk.
-    again = Detector.from_workdir(whole)
-    jax.tree.map(np.testing.assert_array_equal, again.variables, expected.variables)
-    with pytest.raises(UserError, match=r"never written, .* give --data ROOT"):
-        evaluate_run(whole)
-    data = simulate_dataset(_config().simulation, tmp_path / "data", progress=False)
-    evaluate_run(whole, other={"roots": (str(data),)}, num_visualizations=0)
-    assert (whole / "evaluation_data" / "metrics.json").exists()
-    finer = SimulationOptions(
-        train_sequences=0, test_sequences=1, frames_per_sequence=1, output="projection"
-    )
-    data = simulate_dataset(finer, tmp_path / "finer", progress=False)
-    with pytest.raises(
-        UserError, match=r"doppler_bins is 4, expected 16, as the radar"
-    ):
-        evaluate_run(whole, other={"roots": (str(data),)})
-    assert not (data / "records").exists()
-    rows = [json.loads(x) for x in (whole / "metrics.jsonl").read_text().splitlines()]
-    assert len({row["focal"] for row in rows if "focal" in row}) == 4

@@ -2,9 +2,8 @@
 
 import matplotlib
 import numpy as np
-from click.testing import CliRunner
 from matplotlib.figure import Figure
-from reference_points import draw_reference_points, main
+from reference_points import draw_reference_points
 
 from radejax.geometry.camera import CameraCalibration
 
@@ -37,13 +36,3 @@ def test_valid_points_and_the_radar_are_drawn_in_pixels():
     # Every second range bin: only the first point.
     drawn = draw_reference_points(*args, every=(2, 1, 1))
     np.testing.assert_allclose(drawn.get_array(), [5.0])
-
-
-def test_labels_of_another_version_name_the_option(tmp_path):
-    path = tmp_path / "00033_00001.txt"
-    header = "* idx(a_b)=00033_00001_00002_00001_00004, timestamp=0.5"
-    path.write_text(f"{header}\n*, 0, 0, Sedan, 6.8, -6.7, -0.5, 0.5, 2, 1, 1\n")
-    words = [str(path), str(path), "--label", str(path)]
-    error = CliRunner().invoke(main, words).stderr
-    assert "of v2.1 labels" in error
-    assert error.endswith("another version need --version, such as v1.0\n")

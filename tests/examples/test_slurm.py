@@ -51,13 +51,6 @@ def _start(folder, first="waits", second=0, arguments=(), **variables):
     )
 
 
-@pytest.mark.parametrize("status", [0, 143])
-def test_a_job_that_ends_by_itself_is_not_queued_again(status, tmp_path):
-    process = _start(tmp_path, first=status)
-    assert process.wait(timeout=20) == status
-    assert not (tmp_path / "scontrol").exists()
-
-
 @pytest.mark.parametrize(
     ("status", "is_requeued"), [(0, True), (143, True), (1, False)]
 )

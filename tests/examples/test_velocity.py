@@ -3,33 +3,9 @@
 import json
 import pathlib
 
-import numpy as np
 import pytest
 import velocity
 from click.testing import CliRunner
-
-from radejax import models
-from radejax.core.structures import Boxes
-
-
-def test_the_config_names_the_functions_of_the_example() -> None:
-    config = velocity.get_config("short")
-    config.check_imports()
-    assert config.loss.weights["velocity_loss"] == 4.0
-    assert config.loss.weights["focal"] == 8.0
-    assert dict(models.build(config.model).options.outputs) == {"velocity": 2}
-
-
-def test_only_objects_that_move_over_ground_count_as_moving() -> None:
-    def boxes(**extras: np.ndarray) -> Boxes:
-        frame, names = np.zeros(2, np.int64), np.array(["Sedan"] * 2)
-        return Boxes(frame, np.ones((2, 7)), names, extras=extras)
-
-    found = boxes(velocity=np.array([[3.0, 4.0], [1.0, 0.0]]))
-    truth = boxes(velocity_mps=np.zeros((2, 2)), speed_mps=np.array([0.2, 9.0]))
-    assert velocity.velocity_error_mps(found, truth).tolist() == [5.0, 1.0]
-    error = velocity.moving_error_mps(found, truth)
-    np.testing.assert_array_equal(error, [np.nan, 1.0])
 
 
 @pytest.mark.slow

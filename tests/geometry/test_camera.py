@@ -145,10 +145,8 @@ def test_batches_of_cameras_under_jit(image):
     ("key", "line", "message"),
     [
         ("fx", "fx= 1", r"1: expected 'key: number'"),
-        ("fx", "\udcff", r"\d+: expected 'key: number'"),
         ("k3", "", " camera calibration lacks k3"),
         ("img_size_w", "img_size_w: 0", " width is 0, expected 1 to 65536 pixels"),
-        ("fx", "fx: -1", r" focal length is \[-1.0, .*\], expected above 0"),
         ("k1", "k1: nan", " k1 is nan, not a finite number"),
         ("k1", "k1: 1e308", r" k1 is 1e\+308"),
     ],
@@ -171,10 +169,8 @@ def sideways(yaw_deg):
     ("call", "message"),
     [
         (lambda: CameraCalibration.from_kradar("cam_9.yml"), r"cam_9\.yml does not"),
-        (lambda: forward_camera(intrinsics=(1.0, 2.0)), "intrinsics is"),
         (lambda: forward_camera().camera("fisheye"), "raw, pinhole"),
         (lambda: sideways(270), r"cam\.yml: not the calibration of a front"),
-        (lambda: sideways(180), r"cam\.yml: not the calibration of a front"),
         (lambda: sideways(0), r"cam\.yml: not the calibration of a front"),
     ],
 )
@@ -187,12 +183,8 @@ def test_wrong_arguments_are_named(call, message):
     ("center_px", "size_px", "is_fine"),
     [
         ((628.72, 369.31), (1280, 720), True),  # K-Radar
-        ((961.27, 624.9), (1936, 1216), True),  # View-of-Delft
-        ((341.74, 200.74), (672, 376), True),  # RADIATE, and sizes of other images
         ((341.74, 200.74), (1280, 720), False),  # of nearly the same aspect
-        ((341.74, 200.74), (1344, 376), False),
         ((341.74, 200.74), (320, 180), False),
-        ((628.72, 30.0), (1280, 380), True),  # without the upper part
         ((628.72, -30.0), (1280, 320), False),
     ],
 )

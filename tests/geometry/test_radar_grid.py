@@ -120,21 +120,14 @@ def test_values_survive_json_and_compare_and_hash():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: changed(range_m=[1.0]), "range_m must be a vector of at least 2 bins"),
         (lambda: changed(range_m=[2.0, 1.0]), "be increasing, got 2 before 1$"),
-        (lambda: changed(azimuth_rad=[0.0, 1.0, 0.5]), "be increasing or decreasing"),
-        (lambda: changed(azimuth_rad=[0.0, np.inf]), "azimuth_rad must be finite"),
         (
             lambda: changed(azimuth_rad=np.linspace(-53, 53, 107)),
             "azimuth_rad must be finite, to 3.* radians .* -53 to 53$",
         ),
-        (lambda: changed(doppler_mps=np.zeros((2, 2))), "doppler_mps must be a vector"),
         (lambda: changed(fov_range_m=np.nan), "positive, to 236.074 .*, got nan"),
-        (lambda: changed(range_m=np.linspace(0, 0.118, 9)), "positive, to 0.236 for"),
         (lambda: changed(fov_azimuth_rad=53.0), "fov_azimuth.* positive, to 1.85005"),
         (lambda: changed(doppler_mps=[], elevation_rad=[]), "are both empty"),
-        (lambda: KRADAR.padded(8, "bent"), "is 'bent', expected true or stretched"),
-        (lambda: UNEVEN.padded(8, "stretched"), "expected true for uneven axes"),
     ],
 )
 def test_bad_axes_are_rejected(call, message):

@@ -214,9 +214,3 @@ def test_yaw_vector_of_8_scales_the_box():
     np.testing.assert_allclose(bev(eight, box), [[0.25]], rtol=1e-6)
     eight[:, 6:] = 0
     np.testing.assert_array_equal(bev(eight, box), [[0.0]])
-
-
-@pytest.mark.wrong_types
-def test_bad_shapes_are_rejected():
-    with pytest.raises(ValueError, match=r"must be \[..., 7\] or \[..., 8\], got"):
-        bev(np.zeros((2, 5)), np.zeros((2, 7)))

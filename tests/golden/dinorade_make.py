@@ -1,27 +1,15 @@
-"""Golden numbers for the radar-camera model: where they come from and how to repeat it.
+"""Seeded weights and inputs of the golden numbers for the radar-camera model.
 
-`dinorade_vit.npz`, `dinorade_deform_attn.npz` and `dinorade_geometry.npz` are excerpts
-of the project's reference fixtures, which were made by running Hugging Face
-transformers 5.23.0 (`DINOv3ViTModel`), the pure-torch deformable attention and the
-released fusion code (RADE-Net, commit 9a94d64) on a CPU with torch 2.13.0. Weights and
-inputs are not stored: they follow from names and seeds as below.
-
-    python tests/golden/dinorade_make.py PATH_TO_FIXTURES
-
-Tolerances reached on a CPU: ViT 6e-6, deformable attention 1e-6 (gradients 5e-7 of
-their maximum), reference points 3e-7.
+The numbers themselves are in `dinorade_*.npz` and `released.npz`, see README.md.
 """
 
 import json
 import pathlib
-import sys
 import zlib
 
 import numpy as np
 
 SEED = 1234
-UNUSED = ("projected_value", "grad_projected_value", "initial_sampling_offsets_bias")
-UNUSED += ("grad_locations", "grad_weights", "grad_locations_reliable")
 
 
 def seeded_tensor(name: str, shape: tuple[int, ...]) -> np.ndarray:
@@ -120,36 +108,3 @@ def write_tiny_folder(folder: pathlib.Path) -> pathlib.Path:
     (folder / "config.json").write_text(json.dumps(TINY_CONFIG))
     safetensors.numpy.save_file(tiny_tensors(), folder / "model.safetensors")
     return folder
-
-
-def main(fixtures: pathlib.Path, out: pathlib.Path) -> None:
-    with np.load(fixtures / "dinov3" / "tiny.npz") as tiny:
-        last = tiny["64x96__last_hidden_state"]
-        np.savez_compressed(out / "dinorade_vit.npz", last_hidden_state=last)
-    info = json.loads((fixtures / "deform_attn" / "deform_attn.json").read_text())
-    with np.load(fixtures / "deform_attn" / "deform_attn.npz") as file:
-        kept = ("module_two_levels", "module_box_reference")
-        names = {k: k.split("__") for k in file.files}
-        arrays = {
-            k: file[k]
-            for k, name in names.items()
-            if name[0] in kept and name[-1] not in UNUSED
-        }
-        info = {k: info[k] for k in kept}
-        np.savez_compressed(
-            out / "dinorade_deform_attn.npz", info=json.dumps(info), **arrays
-        )
-    with np.load(fixtures / "dinorade" / "geometry.npz") as file:
-        names = ("index", "reference_points_f64", "valid")
-        arrays = {k: file[k][::3] for k in names}
-    info = json.loads((fixtures / "dinorade" / "dinorade.json").read_text())["geometry"]
-    np.savez_compressed(
-        out / "dinorade_geometry.npz",
-        intrinsics=info["intrinsics"],
-        extrinsics=info["extrinsics_3x4"],
-        **arrays,
-    )
-
-
-if __name__ == "__main__":
-    main(pathlib.Path(sys.argv[1]), pathlib.Path(__file__).parent)

@@ -78,30 +78,6 @@ def test_eight_devices_and_a_detector_predict_the_same_as_one(setup):
     _assert_same(alone, expected)
 
 
-def test_a_detector_sees_no_frames_that_are_not_there(setup):
-    seen = []
-
-    class Spy(Detector):
-        def __call__(self, frames, *inputs):
-            seen.append(len(frames.frame))
-            return super().__call__(frames, *inputs)
-
-    predict_dataset(Spy(_saved(setup)), setup.records, setup.frames, 3, progress=False)
-    assert seen == [3, 2]
-
-
-def test_a_prediction_stops_when_asked(setup):
-    asked = []
-
-    def should_stop():
-        asked.append(True)
-        return True
-
-    with pytest.raises(devices.Stopped):
-        Evaluation(setup.config, setup.data).validate(setup.variables, should_stop)
-    assert asked == [True]
-
-
 def test_scores_during_training_name_their_protocol(setup):
     scores = Evaluation(setup.config, setup.data).validate(setup.variables)
     name = "test/map_3d_iou30/coco101/score>0.45"

@@ -5,10 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from flax import traverse_util
 
 from radejax import models
-from radejax.core.errors import UserError
 from radejax.geometry.boxes import boxes7_from_8
 from radejax.models.options import RadeNetOptions
 from radejax.models.radenet import vehicle_from_beam
@@ -112,24 +110,3 @@ def test_bfloat16_is_near_float32(small, variables, apply):
     ):
         assert np.abs(actual - wide).max() > 0  # it did compute in bfloat16
         assert np.abs(actual - wide).max() < 0.1 * np.abs(wide).max()
-
-
-def test_two_frames_have_twice_the_channels_of_the_first_convolution_only(small):
-    def shapes(num_frames, **changes):
-        model = models.build(small.replace(**changes), num_frames)
-        x = jnp.zeros((1, 8, 8, 13 * num_frames))
-        params = jax.eval_shape(model.init, jax.random.key(0), x)["params"]
-        flat = traverse_util.flatten_dict(params, sep="/")
-        return {name: leaf.shape for name, leaf in flat.items()}
-
-    for changes in ({}, {"input_stem": True}):
-        one, two = shapes(1, **changes), shapes(2, **changes)
-        other = {name: (one[name], two[name]) for name in one if one[name] != two[name]}
-        bins = small.doppler_bins
-        expected = [13] if not changes else [bins, 13 - bins]
-        assert [(a[-2], b[-2]) for a, b in other.values()] == [
-            (n, 2 * n) for n in expected
-        ]
-        assert one.keys() == two.keys()
-    with pytest.raises(UserError, match=r"\[B, R, A, 26\] .* got \(1, 8, 8, 13\)"):
-        models.build(small, 2).init(jax.random.key(0), jnp.zeros((1, 8, 8, 13)))

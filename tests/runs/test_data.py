@@ -6,17 +6,14 @@ import shutil
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 
 from radejax import models
 from radejax.config import Config
 from radejax.core.errors import UserError
 from radejax.data.kradar import KRadar
-from radejax.data.kradar.reduce import reduce_dataset
-from radejax.geometry.radar_grid import RadarGrid
 from radejax.runs import data as run_data
-from radejax.runs.data import Data, data_name, data_of_run, located, open_data
+from radejax.runs.data import Data, data_of_run, located, open_data
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
 
@@ -106,16 +103,6 @@ def test_frames_are_projected_beside_their_data_once(
             r"input: 0\.64\d ± 0\.04\d in the frames to train", caplog.text
         )
         assert "the network sees" not in caplog.text
-        _open(config.replace(model={"input_center": 0.4}))
-        _open(config.replace(model={"input_center": 0.6, "input_scale": 14.0}))
-        _open(config.replace(model={"input_center": 0.1, "input_scale": 20.0}))
-    constant, far = re.findall(r"the network sees .*", caplog.text)
-    advice = "set --config.model.input_center=0.64"
-    assert re.match(r"the network sees an input of 0\.24\d ± 0\.04\d, ", constant)
-    assert f"nearly constant and not that of K-Radar (0.63): {advice}" in constant
-    assert re.match(
-        rf"the network sees an input of 10.\d ± 0.\d+, far from 0: {advice}", far
-    )
     assert data.options.roots == (str(root),)
     assert data.options.records == str(root / "records")
     assert len(data.records.keys()) == 6
@@ -143,47 +130,6 @@ def test_frames_of_the_splits_without_labels_are_counted(
     assert "split entries of sequences that are not here: 2" in caplog.text
 
 
-def test_reduced_releases_are_read_with_and_without_doppler(
-    root: pathlib.Path, tmp_path: pathlib.Path
-) -> None:
-    """Also next to each other, as they have records of their own."""
-    simulation = SMALL.replace(frames_per_sequence=1, image_width=0)
-    tensors = simulate_dataset(simulation, tmp_path / "tensors", progress=False)
-    reduced = tmp_path / "reduced"
-    reduce_dataset([tensors], reduced, "polar3d")
-    found = {}
-    for doppler_bins in (16, 0):
-        config = _config(reduced, release="polar3d").replace(
-            model={"doppler_bins": doppler_bins}, simulation=simulation
-        )
-        data = _open(config)
-        assert data.frames.grid.num_doppler == doppler_bins
-        found[doppler_bins] = data.records[data.split("test")[0].key]
-    assert found[16].shape == (64, 56, 16 + 9)
-    np.testing.assert_array_equal(found[0], found[16][..., 16:])
-    with pytest.raises(UserError, match=r"reduced: polar3d, but the model is for rpc"):
-        _open(config.replace(data={"release": "rpc"}))
-    recorded = {"release": None, "roots": (str(root),)}
-    with pytest.raises(
-        UserError, match=r"doppler_bins is 0, expected 16, as the radar"
-    ):
-        _open(config.replace(data=recorded, simulation=None))
-
-
-def test_results_on_other_data_are_named_by_folder_and_labels(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "kradar").mkdir()
-    monkeypatch.chdir(tmp_path / "kradar")
-    assert data_name({"roots": ("..",)}) == tmp_path.name
-    assert data_name({"roots": (".",)}) == "kradar"
-    assert data_name({"roots": ("/a/b", "/c"), "labels": "/x/v1.zip"}) == "b_v1"
-    assert data_name({"labels": "/x/v1.zip"}) == "v1"
-    assert data_name({"label_version": "v1.1"}) == "other"
-    part = {"sequences": (1, 58), "weather": ("fog",)}
-    assert data_name({"roots": ("/a/b",), **part}) == "b_1-58_fog"
-
-
 def test_frames_without_a_radar_tensor_that_can_be_read_are_left_out(
     root: pathlib.Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -196,32 +142,6 @@ def test_frames_without_a_radar_tensor_that_can_be_read_are_left_out(
     assert len(data.split("all")) == len(data.records.keys()) == 5
     part = _open(_config(root, sequences=(1, 3)))  # the same records
     assert len(part.split("all")) == 3
-
-
-def test_frames_that_are_in_no_split_are_counted(
-    root: pathlib.Path, tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    disk = tmp_path / "disk2"
-    (disk / "split").mkdir(parents=True)
-    for number in "23":  # of the train and of the test split
-        shutil.move(root / number, disk / number)
-    entries = (root / "split" / "train.txt").read_text().splitlines(keepends=True)
-    for folder, number in ((root, "1,"), (disk, "2,")):
-        own = [line for line in entries if line.startswith(number)]
-        (folder / "split" / "train.txt").write_text("".join(own))
-    test = (root / "split" / "test.txt").rename(disk / "split" / "test.txt")
-    with caplog.at_level("WARNING", "radejax"):
-        data = _open(_config(root, disk))
-    assert [frame.sequence for frame in data.split("train")] == [1, 1, 2, 2]
-    assert [frame.sequence for frame in data.split("test")] == [3, 3]
-    assert "not used" not in caplog.text
-    (disk / "split" / "train.txt").unlink()
-    test.write_text(test.read_text().splitlines()[0])
-    with caplog.at_level("WARNING", "radejax"):
-        _open(_config(root, disk))
-    assert "3 frames are not used, as they are in neither the train nor" in caplog.text
-    first = next(frame.key for frame in data.split("train") if frame.sequence == 2)
-    assert f"the first is {first}" in caplog.text
 
 
 def test_a_run_is_evaluated_on_its_part_or_on_all_of_other_folders(
@@ -254,17 +174,6 @@ def test_a_run_is_evaluated_on_its_part_or_on_all_of_other_folders(
     ):
         _, found = data_of_run(saved, changes)
         assert {frame.sequence for frame in found.frames} == expected
-    saved.grid = RadarGrid.reduced(
-        num_doppler=16, num_range=8, num_elevation=9, num_azimuth=8, max_range_m=30.0
-    )
-    with caplog.at_level("WARNING", "radejax"):
-        data_of_run(saved)
-    assert "while the model was trained with 16 x 8 x 9" in caplog.text
-    saved.config = saved.config.replace(model={"doppler_bins": 8})
-    with pytest.raises(
-        UserError, match=r"doppler_bins is 8, expected 16, as the radar"
-    ):
-        data_of_run(saved)
 
 
 def test_sequences_are_held_out_for_validation(

@@ -141,17 +141,11 @@ def evaluated(
     [
         ("test", {"step": "best"}, "_checkpoint_best", "chosen on the test split"),
         ("test", {}, "", ""),
-        ("validation", {"step": "best"}, "_checkpoint_best", ""),
-        ("validation", {"split": "validation"}, "_validation", ""),
         (
             *("validation", {"split": "all", "step": "best"}, "_all_checkpoint_best"),
             "chosen on the validation split",
         ),
-        ("test", {"bootstrap": 7, "figures": "pdf", "min_score": 0.05}, "", ""),
         ("test", {"roi": "wide", "step": 70}, "_checkpoint_70_roi_wide", ""),
-        ("test", {"roi": None}, "_roi_None", ""),
-        ("test", {"roi": "narrow"}, "", ""),
-        ("test", {"split": "lists/fog.txt"}, "_fog", ""),
         ("test", {"out": "elsewhere", "roi": "wide"}, None, ""),
     ],
 )

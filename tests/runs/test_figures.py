@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import pathlib
-from types import SimpleNamespace
 from typing import Any
 
 import click.testing
@@ -16,7 +15,7 @@ from radejax.core.structures import NARROW_ROI, Boxes
 from radejax.data.kradar import KRadar
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.runs import figures
-from radejax.runs.figures import draw_training_samples, frame_scene
+from radejax.runs.figures import draw_training_samples
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
 from radejax.visualize.draw import draw_scenes
@@ -41,48 +40,11 @@ def test_samples_are_drawn_with_their_augmentation(
     draw_training_samples(config, count=2)
     ((rows, grid),) = drawn
     assert len(rows) == 2
-    for frame, scene, target in rows:
-        np.testing.assert_allclose(scene.power, frame.power[:, ::-1])
-        np.testing.assert_array_equal(scene.image, frame.image[:, ::-1])
-        mirrored = frame.ground_truth.box * [1, -1, 1, 1, 1, 1, -1]
-        np.testing.assert_allclose(scene.ground_truth.box, mirrored, atol=1e-5)
-        assert list(scene.ground_truth.cls) == list(frame.ground_truth.cls)
-        bins = grid.nearest_bin(*mirrored[:, :2].T)
-        np.testing.assert_array_equal(target[bins[:, 0], bins[:, 1]], 1.0)
-        pixels = [
-            s.camera.project_boxes(b)[0]
-            for s, b in ((frame, frame.ground_truth.box), (scene, mirrored))
-        ]
-        ends = [np.sort(x[..., 0].reshape(len(mirrored), -1)) for x in pixels]
-        width = scene.image.shape[1]
-        # The camera of the network has no lens distortion.
-        np.testing.assert_allclose(ends[1], (width - ends[0])[:, ::-1], atol=1.5)
     monkeypatch.undo()
     figure = figures.draw_samples(rows, grid)
     titles = [ax.get_title() for ax in figure.axes]
     assert titles[:2] == [rows[0][0].title, "input of the network"]
     assert len(titles) == 8
-    (frame,) = KRadar([tmp_path / "data"])[:1]
-    scene: Scene = frame_scene(
-        frame, rows[0][0].projection, rows[0][0].grid, roi="wide"
-    )
-    assert scene.roi == (0.0, 72.0, -16.0, 16.0, -2.0, 7.6)
-
-
-def test_scenes_are_the_fullest_of_each_weather_in_the_order_of_tables() -> None:
-    weathers = ["heavysnow", "fog", "normal", "hail", "fog"]
-    sizes = [1, 1, 2, 3, 4]
-    frames: Any = [
-        SimpleNamespace(weather=weather, boxes=np.zeros((size, 7)))
-        for weather, size in zip(weathers, sizes, strict=True)
-    ]
-    found = figures.fullest_of_weathers(frames)
-    assert [*found.items()] == [
-        ("normal", 2),
-        ("fog", 4),
-        ("heavysnow", 0),
-        ("hail", 3),
-    ]
 
 
 def test_bins_out_of_view_and_frames_without_image_do_not_count() -> None:
@@ -172,18 +134,3 @@ def test_compared_runs_are_drawn_side_by_side(
         assert other.title.startswith("few.json: ")
         assert one.matches is not None
         assert (one.matches.ground_truth != 0).all()  # all is found
-    # Ground truth in a file has no radar data.
-    monkeypatch.setattr(figures, "draw_scenes", None)
-    truth = tmp_path / "truth.json"
-    truth.write_text(json.dumps(rows))
-    table = {"frame": [0, 1], "sequence": [1, 2], "name": ["a", "b"]}
-    (tmp_path / "frames.json").write_text(json.dumps(table))
-    for path in (*paths, truth):
-        text = path.read_text()
-        for i, frame in enumerate(frames):
-            text = text.replace(f'"{frame.key}"', str(i))
-        path.write_text(text)
-    words[words.index("--data") : words.index("--data") + 2] = ["--ground-truth", truth]
-    done = runner.invoke(main, list(map(str, words)))
-    assert done.exit_code == 0, done.output
-    assert "no scenes are drawn" in caplog.text

@@ -57,12 +57,3 @@ def test_a_folder_without_runs_is_wrong_use(tmp_path: pathlib.Path) -> None:
     done = CliRunner().invoke(runs, [str(tmp_path)])
     assert done.exit_code == 2
     assert "no run in" in done.stderr
-
-
-def test_runs_of_different_metrics_have_a_column(tmp_path: pathlib.Path) -> None:
-    _report(_write(tmp_path / "a", Config(), [1.0]), 1.0)
-    bev = Config().replace(train={"best_metric": "map_bev_iou30"})
-    _report(_write(tmp_path / "b", bev, [1.0]), 2.0)
-    table = CliRunner().invoke(runs, [str(tmp_path)]).output
-    assert "99.00  map_bev_iou30/p/roi=narrow" in table
-    assert "Metric" in table

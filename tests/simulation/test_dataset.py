@@ -12,7 +12,6 @@ import pytest
 import scipy.io
 from PIL import Image
 
-from radejax import Detector, models
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
 from radejax.data.cameras import CameraOptions, camera_inputs
@@ -20,7 +19,6 @@ from radejax.data.kradar import KRadar, read_labels
 from radejax.data.kradar.check import check_dataset
 from radejax.data.kradar.tesseract import read_tesseract
 from radejax.data.projection import project_tensor
-from radejax.inference.saved import SavedModel
 from radejax.simulation import dataset
 from radejax.simulation.camera.renderer import stereo_calibration
 from radejax.simulation.config import SimulationOptions
@@ -201,10 +199,7 @@ class TestRepeating:
         ("lost", "message"),
         [
             ("2/cam-front/*.png", "2/cam-front has 2 of 3 files; copy it again"),
-            ("1/info_label_v2_1/*.txt", "1/info_label_v2_1 has 2 of 3 files"),
-            ("1/radar_tesseract/*.mat", "1/radar_tesseract has 2 of 3 files"),
             ("split/test.txt", "split has 1 of 2 files"),
-            ("3/description.txt", "3 has 0 of 1 files"),
         ],
     )
     def test_an_incomplete_copy_is_an_error(self, tree, tmp_path, lost, message):
@@ -259,16 +254,3 @@ def test_a_sensor_without_elevation_is_a_kradar_tree_without_its_channels(tmp_pa
     projection = frames[0].read_projection(grid)
     assert projection.shape == grid.projection_shape == (32, 14, 4)
     np.testing.assert_array_equal(projection, project_tensor(power)[..., :4])
-    # As the input of a detector, the tensor gives what its projection gives.
-    config = small.radar_config().replace(
-        model={"doppler_bins": 4, "elevation_bins": 0}, data={"num_frames": 2}
-    )
-    stacked = np.tile(projection, 2)[None]
-    variables = small.drawn(models.build(config.model, 2), stacked)
-    saved = SavedModel(config, grid, variables)
-    detector = Detector(saved, batch_sizes=(1,), score_threshold=0.0)
-    by_powers, by_projections = detector([power] * 2), detector([projection] * 2)
-    np.testing.assert_allclose(by_powers.scores, by_projections.scores, atol=1e-3)
-    assert by_powers.is_valid.any()
-    again = detector([str(frames[0].radar_path)] * 2)
-    np.testing.assert_array_equal(again.boxes, by_projections.boxes)

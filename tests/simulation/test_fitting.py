@@ -14,8 +14,6 @@ from PIL import Image
 
 from radejax.cli.main import main
 from radejax.core.errors import DataError, UserError
-from radejax.data.kradar.tesseract import read_tesseract
-from radejax.data.kradar.write import write_tesseract
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
@@ -160,16 +158,3 @@ def test_files_of_another_sensor_and_folders_without_tensors_are_named(
         fit_files([moved], tmp_path / "out")
     with pytest.raises(UserError, match=r"no radar tensors in .*tesseract_\*\.mat"):
         fit_files([recorded / "split"], tmp_path / "out")
-    decibels = 10.0 * np.log10(read_tesseract(path) + 1e-3)
-    write_tesseract(moved, decibels.astype(np.float32))
-    (tmp_path / "radar_grid.json").write_bytes(
-        (recorded / "radar_grid.json").read_bytes()
-    )
-    with pytest.raises(DataError, match=f"{path.name}: .*as in decibels"):
-        fit_files([moved], tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-    done = CliRunner().invoke(
-        main, ["simulate", "--radar", str(path), "--out", str(tmp_path / "x")]
-    )
-    assert done.exit_code != 0
-    assert "is not UTF-8 text" in done.output

@@ -115,15 +115,3 @@ def test_waiting_for_data_is_warned_of_once(wait, tmp_path, monkeypatch, caplog)
     assert caplog.text.count("training waits for data for 67 %") == 1
     assert "raise config.data.num_threads (7 threads" in caplog.text
     assert "on 7 CPUs" in caplog.text
-
-
-def test_a_batch_that_is_loaded_while_the_devices_work_costs_no_time(wait):
-    class Busy:
-        def is_ready(self) -> bool:
-            return False
-
-    throughput: Any = hooks.Throughput(_batches(wait, 0.0, 0.1), 0)
-    next(throughput)
-    throughput(2, None, {"loss": Busy()})
-    next(throughput)
-    assert throughput.measure(4)[1] < 1e-6

@@ -28,7 +28,6 @@ from radejax.training.checkpoints import Checkpoints
 from radejax.training.metric_writer import Scores
 from radejax.training.step import TrainState, count_steps, create_state, make_schedule
 
-Tiny = Any  # the fixture `tiny` of conftest.py
 STEPS_PER_EPOCH = 4
 
 

@@ -1,20 +1,18 @@
 """Logs that agree with the step a run starts from."""
 
-import errno
 import json
 import math
 import pathlib
 import sys
 from unittest import mock
 
-import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
 from radejax.config import Config
 from radejax.core import devices
 from radejax.core.errors import DiskFullError, UserError
-from radejax.training.metric_writer import MetricWriter, log_results
+from radejax.training.metric_writer import MetricWriter
 
 
 def _steps(folder: pathlib.Path) -> list[int]:
@@ -41,16 +39,6 @@ def test_records_after_the_restored_step_are_written_anew(tmp_path):
     assert 0 <= json.loads(last)["minutes"] < 1
 
 
-def test_the_final_results_are_in_tensorboard(tmp_path):
-    with _writer(tmp_path, 0) as writer:
-        writer.write(1, {"focal": 1.0})
-    log_results(tmp_path, 1, {"map_3d_iou30/coco101": 61.0})
-    (path,) = (tmp_path / "tensorboard").glob("*.test")
-    final = path.read_bytes()
-    assert b"test/map_3d_iou30/coco101" in final
-    assert np.float32(61).tobytes() in final
-
-
 def test_other_processes_write_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(devices, "is_main", lambda: False)
     with _writer(tmp_path, 0) as writer:
@@ -68,34 +56,6 @@ def test_metrics_on_a_full_disk_are_one_clear_error(tmp_path):
         (tmp_path / "metrics.jsonl").symlink_to(FULL)
         with pytest.raises(DiskFullError, match="no space left"):
             writer.write(1, {"focal": 1.0})
-
-
-class FullDisk:
-    """A file on a full disk."""
-
-    def write(self, _: bytes) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    def flush(self) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-
-# The error of the writing thread itself, before that of the next flush.
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-@pytest.mark.timeout(60)
-def test_tensorboard_on_a_full_disk_is_an_error_and_blocks_nothing(tmp_path):
-    with _writer(tmp_path, 0) as writer:
-        board = writer._board._get_file_writer().event_writer._ev_writer
-        board._py_recordio_writer._writer = FullDisk()
-        values = {f"value{i}": 1.0 for i in range(100)}
-
-        def log() -> None:
-            for step in range(1000):
-                writer.write(step, values)
-
-        with pytest.raises(DiskFullError, match="no space left"):
-            log()
 
 
 def test_weights_and_biases_copies_tensorboard_and_gets_the_config(

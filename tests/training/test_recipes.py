@@ -9,7 +9,6 @@ import pytest
 
 from radejax import models
 from radejax.config import Config, load_config
-from radejax.core.errors import UserError
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.options import DinoRadeOptions
 from radejax.training.step import (
@@ -88,11 +87,6 @@ def test_a_word_changes_only_its_fields(preset, word, changed):
         # Half of K-Radar's noise and all echoes are positive.
         assert 0.5 <= after["model.input_center"] <= 0.52
         assert (after["model.input_scale"], after["data.release"]) == (25.0, word)
-
-
-def test_words_for_one_field_exclude_each_other():
-    with pytest.raises(UserError, match="exclude each other"):
-        load_config("radenet:sigma3,adaptive")
 
 
 def _shrink(config: Config) -> Config:

@@ -60,15 +60,6 @@ def test_a_box_around_the_camera_is_cut_at_the_near_plane():
     assert len(segments) == 8  # the far face and the four edges towards us
 
 
-def test_squeezed_images_are_shown_undistorted():
-    squeezed, image = CALIBRATION.resized(128, 18), np.zeros((18, 128, 3), np.uint8)
-    sizes = []
-    for given in ((IMAGE, CALIBRATION), (image, squeezed)):
-        ax = camera.draw_camera(*given, title="frame")
-        sizes.append([*ax.figure.get_size_inches(), *ax.get_window_extent().size])
-    np.testing.assert_allclose(*sizes, rtol=1e-6)
-
-
 def test_stereo_pair_is_rejected_with_advice():
     with pytest.raises(UserError, match="read_left_image"):
         camera.draw_camera(np.zeros((72, 256, 3), np.uint8), CALIBRATION)

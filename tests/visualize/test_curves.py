@@ -48,9 +48,3 @@ def test_series_of_a_run_are_read_and_drawn(tmp_path):
         curves.read_metrics(path)
     with pytest.raises(FileNotFoundError, match=r"none\.jsonl"):
         curves.read_metrics(tmp_path / "none.jsonl")
-
-
-def test_moving_mean_by_hand():
-    values = np.array([1.0, 3.0, np.nan, 5.0, 7.0])
-    np.testing.assert_allclose(curves.moving_mean(values, 2), [1.0, 2.0, 3.0, 5.0, 6.0])
-    np.testing.assert_array_equal(curves.moving_mean(values[:1], 3), [1.0])

@@ -117,13 +117,6 @@ def test_the_legend_is_true_of_the_boxes_that_are_drawn(score, expected):
     assert last.get_text().endswith(expected)
 
 
-def test_legend_has_the_range_of_thresholds_of_classes():
-    found = Boxes.one_frame([20.0, -3.0, 0, 4, 2, 1.5, 0], ["Sedan"], [0.875])
-    thresholds = (0.4, 0.2, 0.3)
-    ax = draw.draw_bev(scene(predictions=found, score_threshold=thresholds))
-    assert ax.get_legend().get_texts()[-1].get_text() == "score ≥ 0.2 to 0.4"
-
-
 def test_outcomes_have_their_own_colors_and_labels_do_not_overlap():
     x_m = np.array([10.0, 16.0, 22.0, 30.0])
     box = np.tile([0.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0], (4, 1))
@@ -206,42 +199,6 @@ def test_map_shows_every_bin_of_a_partial_extent():
         draw.draw_map(np.zeros((64, 56)), GRID)
 
 
-def test_scenes_share_a_scale_and_have_an_image_above_a_map():
-    image = np.full((90, 160, 3), 128, np.uint8)
-    truth = Boxes.one_frame([30.0, 2.0, 0.5, 4.5, 2.0, 1.6, 0.2], ["Sedan"])
-    fields = {"ground_truth": truth, "roi": (0, 50, -10, 10, -2, 6)}
-    one, other = scene(image=image, title="fog", **fields), scene(title="rain")
-    other.projection[...] += 0.4
-    other.projection[3, 3] = 50.0  # one strong echo does not darken the maps
-    figure = draw.draw_scenes([one, other])
-    titles = [ax.get_title() for ax in figure.axes]
-    assert [title for title in titles if title] == ["fog", "rain"]
-    assert len(figure.axes) == 4  # image and map, map, color bar
-    assert "power" in figure.axes[-1].get_xlabel()
-    maps = [mesh for ax in figure.axes[1:3] for mesh in ax.findobj(QuadMesh)]
-    assert len({mesh.get_clim() for mesh in maps}) == 1 < len(maps)
-    assert maps[0].get_clim()[1] < 1.0
-    labels = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert labels == ["ground truth", "region of interest"]
-
-
-def test_a_comparison_shows_maps_on_one_scale_and_the_strongest_echo_of_each():
-    first = np.random.default_rng(0).normal(100.0, 0.2, GRID.projection_shape[:2])
-    second = first + 3.0
-    second[40, 20] = 130.0
-    figure = draw.draw_comparison({"recorded": first, "simulated": second}, GRID)
-    maps = [ax for ax in figure.axes if ax.get_title() in ("recorded", "simulated")]
-    assert len(maps) == 2
-    assert len({ax.collections[0].get_clim() for ax in maps}) == 1
-    profile, beams = (
-        ax for ax in figure.axes if ax.get_xlabel().startswith(("range", "azimuth"))
-    )
-    low, high = (np.median(line.get_ydata()) for line in profile.lines)
-    assert high - low == pytest.approx(3.0)
-    row = beams.lines[1].get_ydata()
-    assert (row.argmax(), row.max()) == (20, 0.0)
-
-
 # Slices -------------------------------------------------------------------------------
 
 SMALL = RadarGrid.reduced(num_doppler=4, num_range=6, num_elevation=3, num_azimuth=5)
@@ -299,15 +256,3 @@ def test_there_is_no_slice_of_an_absent_axis():
     flat_scene = Scene(values[..., :1], flat, ground_truth=truth)
     power, elevation = planes(draw.draw_slices(flat_scene))[:2]
     assert (power.shape, elevation.shape) == ((16, 14), (1, 14))
-
-
-@pytest.mark.parametrize(
-    ("centers", "edges"),
-    [
-        ([0.0, 2.0, 4.0], [-1, 1, 3, 5]),
-        ([1.0, 2.0, 4.0], [0.5, 1.5, 3, 5]),
-        ([3.0], [2.5, 3.5]),
-    ],
-)
-def test_edges_of_bins_are_between_their_centers(centers, edges):
-    np.testing.assert_allclose(draw.bin_edges(np.array(centers)), edges)

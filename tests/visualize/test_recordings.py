@@ -35,17 +35,6 @@ def test_gif_has_every_frame_in_order(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.gif"]
 
 
-def test_gif_keeps_the_colors_of_thin_lines(tmp_path):
-    colors = np.random.default_rng(0).integers(0, 256, (40, 50, 3), np.uint8)
-    colors[20, 10:14] = 255, 127, 110
-    figure = color_figure("white")
-    figure.figimage(colors)
-    path = recordings.animate([figure], tmp_path / "a.gif")
-    with Image.open(path) as gif:
-        shown = np.asarray(gif.convert("RGB"))
-    assert (shown == (255, 127, 110)).all(-1).sum() >= 4
-
-
 @pytest.mark.parametrize(
     ("frames", "name", "message"),
     [([], "a.gif", "no frames"), (["white"], "a.mp4", r"as \.gif")],
@@ -71,23 +60,6 @@ def frame(index: int) -> Scene:
         time_s=1.6e9 + 0.1 * index,
         title=f"frame {index}",
     )
-
-
-def test_mesh_covers_the_ground_between_bin_centers():
-    vertices, triangles = recordings.ground_mesh(GRID)
-    assert triangles.shape == (2 * 15 * 8, 3)
-    a, b, c = (vertices[triangles[:, i], :2] for i in range(3))
-    u, v = b - a, c - a
-    areas = np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) / 2
-    # Polygonal fan: half r^2 sin(step) in each of the eight sectors.
-    step = np.deg2rad(106 / 8)
-    np.testing.assert_allclose(areas.sum(), 8 * 0.5 * 118.0**2 * np.sin(step))
-
-
-def test_yaw_quaternions():
-    quaternions = recordings.yaw_quaternions(np.array([0.0, np.pi / 2]))
-    half = np.sqrt(0.5)
-    np.testing.assert_allclose(quaternions, [[0, 0, 0, 1], [0, 0, half, half]])
 
 
 def test_without_rerun_or_the_suffix_nothing_is_written(tmp_path, monkeypatch):

@@ -24,21 +24,6 @@ def test_scenes_hold_boxes_of_one_frame_on_their_grid():
         Scene(projection[None], GRID)
 
 
-@pytest.mark.parametrize(
-    ("values", "limits"),
-    [
-        ([*np.linspace(0.0, 1.0, 1001), np.nan, np.inf], (0.2, 0.999)),
-        (np.eye(100)[0], (0.0, 0.901)),
-        (np.eye(2000)[0], (0.0, 1.0)),
-        ([3.0, 3.0], (3.0, 4.0)),
-        ([np.nan], (0.0, 1.0)),
-    ],
-)
-def test_color_limits_ignore_what_is_not_finite(values, limits):
-    found = style.color_limits_of(np.array(values))
-    assert found == pytest.approx(limits, rel=1e-3)
-
-
 def test_figures_are_saved_whole_or_not_at_all(tmp_path, monkeypatch):
     figure = style.new_figure(2, 2)
     path = style.save_figure(figure, tmp_path / "a" / "b.png")

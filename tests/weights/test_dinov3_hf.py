@@ -92,10 +92,7 @@ WEIGHTS = "model.safetensors"
     ("contents", "message"),
     [
         ({WEIGHTS: None}, f"lacks {WEIGHTS}"),
-        ({WEIGHTS: None, f"{WEIGHTS}.index.json": b""}, "weights in several files"),
         ({WEIGHTS: b"PK" * 99}, "not a safetensors file"),
-        ({WEIGHTS: None, "config.json": None}, f"lacks config.json and {WEIGHTS}"),
-        ({"config.json": b"{"}, "is not valid JSON"),
         ({"config.json": b"[1]"}, "config.json: expected a JSON object"),
     ],
 )
@@ -112,12 +109,8 @@ def test_incomplete_or_corrupted_folders(folder, contents, message):
     ("change", "message"),
     [
         ({"model_type": "dinov2"}, "'dinov2', expected 'dinov3_vit'"),
-        ({"hidden_act": "relu"}, "is 'relu', expected 'gelu'"),
         ({"num_hidden_layers": None}, "lacks num_hidden_layers"),
-        ({"num_hidden_layers": 10**9}, "is 1000000000, expected .* at most 65536"),
         ({"num_attention_heads": 7}, "hidden_size is 96, expected a multiple of 4"),
-        ({"layer_norm_eps": float("nan")}, "is nan, expected 1e-05"),
-        ({"num_hidden_layers": 2}, "unexpected layer.2."),
         ({"num_hidden_layers": 200}, "missing layer.100."),
     ],
 )
@@ -180,15 +173,10 @@ def test_features_of_the_original_code(sources, name, tmp_path):
     ("name", "change", "message"),
     [
         ("timm", {"architecture": "convnext_tiny"}, "architecture is 'convnext_tiny'"),
-        ("timm", {"patch_embed.proj.weight": None}, "not the tensors of a DINOv3"),
         ("dinov2", {"model_type": "tips"}, "json: model_type is 'tips', expected a"),
-        ("dinov2", {"layer_norm_eps": 1e-5}, "json: layer_norm_eps is 1e-05, expected"),
-        ("dinov2", {"patch_size": 16}, r"patch_embeddings.weight .*14, 14\), expected"),
         ("meta", {"rope_embed.periods": [1, 2]}, "periods are not powers of 100"),
-        ("meta", {"blocks.0.attn.qkv.bias_mask": [1] * 96}, "unexpected .*k_proj.bias"),
         ("meta", {"blocks.0.ls1.gamma": [np.nan] * 32}, "layer_scale1.* not finite"),
         ("meta", {"pos_embed": [0]}, "DINOv2 is read from its Hugging Face"),
-        ("meta", {"cls_norm.weight": [1] * 32}, "unexpected cls_norm.weight"),
         ("timm_qkvb", {"blocks.0.attn.q_bias": None}, "missing .*q_proj.bias"),
     ],
 )

@@ -47,14 +47,6 @@ def test_weights_of_another_transformer_are_rejected(monkeypatch):
     monkeypatch.setattr(dinov3_hf, "load", lambda path: (found, {"params": TRUNK}))
     with pytest.raises(UserError, match="num_registers is 3 there and 4 here"):
         image_backbone.load_image_backbone("folder", model)
-    with pytest.raises(
-        UserError, match="folder is DINOv3, another backbone than config"
-    ):
-        image_backbone.load_image_backbone("folder", model)
-    other = load_config("dinorade:rcw_dinov2").model.image
-    monkeypatch.setattr(dinov3_hf, "load", lambda path: (ViT(other), {"params": TRUNK}))
-    with pytest.raises(UserError, match=r"is DINOv2, .*position_grid is \d+ there"):
-        image_backbone.load_image_backbone("folder", model)
     same = ViT(model.options.image.replace(attention="xla", layer_scale=0.5))
     monkeypatch.setattr(dinov3_hf, "load", lambda path: (same, {"params": TRUNK}))
     loaded = image_backbone.load_image_backbone("folder", model)

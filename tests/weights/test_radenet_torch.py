@@ -17,7 +17,6 @@ from radejax.core.errors import DataError, UserError
 from radejax.inference.saved import load_torch
 from radejax.models.options import RadeNetOptions
 from radejax.weights import radenet_torch
-from radejax.weights.convert import torch_name
 from radejax.weights.radenet_torch import torch_shapes
 
 from ..torch_files import write_pth
@@ -147,26 +146,16 @@ def test_released_models_without_cbam_still_have_its_tensors(
 def test_what_cannot_be_converted_is_named(small_state, radenet_golden, tmp_path):
     _, paper, paper_variables = load_variant(radenet_golden, "paper")
     scaled = OVERRIDES | {"input_center": 0.545, "input_scale": 25.0}
-    far = "backbone.encoder_block_100000000.adjust_input.weight"
-    of_other_code = radenet_torch.rules("expanded"), "params/neck/strip/kernel"
     for call, message in (
         (lambda: load({"model": small_state, "ema": small_state}), "one state dict"),
-        (lambda: load({"a": 1}), r"tensors backbone\.\* or rad_backbone\.\*, found 0"),
-        (lambda: load([1, 2]), "found 0"),
         (lambda: load({"backbone.fc.weight": np.zeros(3)}), "not a state dict of"),
-        (
-            lambda: load(small_state | {far: np.zeros((1, 1, 1, 1))}, **OVERRIDES),
-            "without a tensor .*encoder_block_4",
-        ),
         (lambda: load(small_state, width=3, **OVERRIDES), r"model\.width is not a"),
-        (lambda: load(small_state, num_groups=8), "give doppler_bins and"),
         (lambda: load(tmp_path / "none.pth"), "none.pth"),
         (lambda: radenet_torch.save(paper, paper_variables), 'no cbam="paper"'),
         (
             lambda: radenet_torch.save(*load(small_state, **scaled)),
             r"input_center=0\.545 and input_scale=25\.0",
         ),
-        (lambda: torch_name(*of_other_code), "neck/strip has no counterpart in the"),
     ):
         with pytest.raises((DataError, UserError, FileNotFoundError), match=message):
             call()

@@ -41,18 +41,6 @@ def test_reads_torchs_files_exactly(released, torchs_file):
             np.testing.assert_array_equal(value, expected[key], strict=True)
 
 
-def test_a_big_endian_file(tmp_path):
-    values = np.arange(6, dtype=">f4").tobytes()
-    write_zip(tmp_path / "x.pth", tensor(), **{"0": values})
-    with zipfile.ZipFile(tmp_path / "x.pth") as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
-    with zipfile.ZipFile(tmp_path / "x.pth", "w") as archive:
-        for name, data in (members | {"x/byteorder": b"big"}).items():
-            archive.writestr(name, data)
-    content = torch_file.read(tmp_path / "x.pth")
-    np.testing.assert_array_equal(content["a"], [[0, 1, 2], [3, 4, 5]])
-
-
 class Attack:
     """Would create a file when unpickled in the usual way."""
 
@@ -82,11 +70,7 @@ def tensor(size=6, shape=(2, 3), strides=(3, 1), offset=0, storage="FloatStorage
     [
         ({"offset": 1}, "reaches outside its storage"),
         ({"shape": (2, -3)}, "not sizes"),
-        ({"offset": -1}, "not sizes"),
         ({"shape": (2, 30)}, r"tensor \(2, 30\) reaches outside its storage \(6,\)"),
-        ({"shape": (1000, 1000, 600), "strides": (0, 0, 0)}, "reaches outside"),
-        ({"shape": (2, 3, 1)}, "corrupted"),
-        ({"shape": (1,) * 20, "strides": (1,) * 20}, "more than 16 axes"),
         ({"size": 7}, "has 24 bytes for 7 float32"),
         ({"storage": "QInt8Storage"}, "QInt8Storage, which is not read"),
     ],
@@ -139,7 +123,6 @@ def opcodes(*parts):
 DOUBLED = b"".join(  # each tuple has the one before it twice
     b"q" + bytes([i]) + b"h" + bytes([i]) + b"\x86" for i in range(60)
 )
-STORAGE = b"ctorch\nFloatStorage\n"
 REBUILD = b"ctorch._utils\n_rebuild_tensor_v2\n"
 
 
@@ -147,18 +130,10 @@ REBUILD = b"ctorch._utils\n_rebuild_tensor_v2\n"
     "pickled",
     [
         opcodes(b"}N", DOUBLED, b"K\x01s"),  # a key whose hash takes 2**60 steps
-        opcodes(b"}N", b"\x85" * 100_000, b"K\x01s"),  # or 100,000 calls deep
         opcodes(b"}(N", DOUBLED, b"K\x01u"),
-        opcodes(b"(", pickle_text("storage"), b"N", DOUBLED, b"NNK\x01tQ"),
-        opcodes(STORAGE, b"N", DOUBLED, b"R"),
         opcodes(REBUILD, b"(NNNNNNNNNtR"),
         opcodes(REBUILD, b"(]K\x00)))tR"),  # a list as a storage
-        opcodes(b"\x8f"),  # a set
-        opcodes(b"\x82\x01"),  # a class by its registered number
-        opcodes(b"\x8d", (2**40).to_bytes(8, "little"), b"x"),
-        opcodes(b"X\xff\xff\xff\x7fx"),
         b"\x80\x02",
-        b"",
     ],
 )
 def test_malformed_pickles_are_rejected_at_once(tmp_path, pickled):
@@ -166,15 +141,6 @@ def test_malformed_pickles_are_rejected_at_once(tmp_path, pickled):
     write_zip(path, pickled, **{"0": bytes(24)})
     with at_most(64 << 20), pytest.raises(DataError, match=r"x\.pth: "):
         torch_file.read(path)
-
-
-def test_tensors_of_one_storage_share_its_memory(tmp_path):
-    one = pickle_tensor("0", 10_000, (10_000,), (1,))
-    write_zip(
-        tmp_path / "x.pth", opcodes(b"(", one * 500, b"t"), **{"0": bytes(40_000)}
-    )
-    with at_most(4 << 20):
-        assert len(torch_file.read(tmp_path / "x.pth")) == 500
 
 
 def test_deflated_members_are_limited(tmp_path):

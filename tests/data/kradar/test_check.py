@@ -1,5 +1,3 @@
-import dataclasses
-import errno
 import json
 import math
 import shutil
@@ -9,14 +7,9 @@ import pytest
 from PIL import Image
 
 from radejax.core.errors import UserError
-from radejax.core.structures import CLASSES
-from radejax.data.check import HealthReport
-from radejax.data.dataset import Summary
-from radejax.data.kradar import KRadar, check, write
+from radejax.data.kradar import KRadar, write
 from radejax.data.kradar.check import check_dataset
 from radejax.data.kradar.labels import Label
-
-from ... import small_models as small
 
 SEDAN = "expected about 4.61 x 2.18 x 1.91 m"
 
@@ -98,20 +91,6 @@ def test_everything_that_is_wrong_is_named(root, caplog):
     found = {frame.header.radar: frame.tesseract_path for frame in data[:5]}
     assert found[6] is None
     assert found[4] is not None
-
-
-def test_a_camera_calibration_for_other_images_is_reported(root):
-    path = root / "common/cam_front0.yml"
-    path.parent.mkdir()
-    camera = small.calibration(intrinsics=(50.0, 50.0, 32.0, 20.0), width=64, height=40)
-    path.write_text(camera.to_kradar_text())
-    assert check_dataset(root, camera_calibration=root).num_problems == 0
-    wrong = dataclasses.replace(camera, width=128, height=80)
-    path.write_text(wrong.to_kradar_text())
-    problems = check_dataset(root, camera_calibration=root).summary.problems
-    assert [kind for kind, _ in problems] == 2 * ["image or calibration"]  # a sequence
-    text = f"1/00004_00001: {path}: principal point 32, 20 in an image of 128 x 80"
-    assert problems[0][1].startswith(text)
 
 
 @pytest.mark.parametrize(
@@ -210,39 +189,6 @@ def test_an_image_that_is_not_complete_is_found_if_asked(root):
     assert f"{path}: corrupted, not a readable image" in text
 
 
-def test_a_file_that_cannot_be_read_is_not_corrupted(root, monkeypatch):
-    def fail(path, *_, **__):
-        raise OSError(errno.EIO, "Input/output error", str(path))
-
-    monkeypatch.setattr(check, "check_frame", fail)
-    report = check_dataset(root)
-    assert report.summary.problem_counts() == {"tesseract not readable": 12}
-    assert report.sequences[0]["radar_corrupted"] == 0
-
-
 def test_no_frames_are_no_clean_bill(root):
     with pytest.raises(UserError, match="no frames of these sequences and weathers"):
         check_dataset(root, weather=["sleet"])
-
-
-def test_conditions_that_contradict_the_published_ones(root):
-    (root / "radar_grid.json").unlink()
-    notes = check_dataset(root).summary.notes
-    assert len(notes) == 2
-    assert "1: description.txt has urban,day,fog; K-Radar published urban,n" in notes[0]
-
-
-def test_classes_that_are_hardly_trained_on_are_marked():
-    none = dict.fromkeys(CLASSES, 0)
-    rows = [
-        {"split": "train", "weather": "rain", **none, "Sedan": 98, "Bus or Truck": 2},
-        {"split": "train", "weather": "fog", **none, "Sedan": 99, "Bus or Truck": 1},
-        {"split": "test", "weather": "fog", **none, "Sedan": 1000, "Bicycle": 1},
-    ]
-    text = HealthReport(["x"], "v2.1", [], rows, Summary()).to_text()
-    rain, fog, test = [line for line in text.splitlines() if "%)" in line]
-    assert " 98 (98.0 %) " in rain
-    assert " 2 ( 2.0 %) " in rain  # not under 2 %
-    assert " *1 ( 1.0 %) " in fog
-    assert " 1,000 (99.9 %) " in test
-    assert "*" not in test

@@ -83,31 +83,6 @@ def test_writing_resumes_and_lists_corrupted_tensors(kradar_root, tmp_path):
         reduce_dataset([source], source, "rpc")
 
 
-def test_points_of_another_rate_are_not_mixed(kradar_root, tmp_path):
-    out = reduced_root(kradar_root, tmp_path / "out", "rpc")
-    (out / "2/rpc_00005.npy").unlink()
-    with pytest.raises(UserError, match=r"options\.rate is 0\.2 there and 0\.1 here"):
-        reduce_dataset([kradar_root], out, "rpc", 0.1)
-    assert reduce_dataset([kradar_root], out, "rpc", 0.2).num_written == 1
-    for path in out.glob("manifest.*"):
-        path.unlink()
-    with pytest.raises(UserError, match=r"rpc_0000\d\.npy is there, but no manifest"):
-        reduce_dataset([kradar_root], out, "rpc", 0.2)
-
-
-def test_frames_of_tensors_that_were_replaced_are_counted(
-    kradar_root, tmp_path, caplog
-):
-    source = shutil.copytree(kradar_root, tmp_path / "in")
-    out = reduced_root(source, tmp_path / "out", "polar3d")
-    assert reduce_dataset([source], out, "polar3d").num_found == 12
-    assert not caplog.messages
-    (source / "2/radar_tesseract/tesseract_00005.mat").touch()
-    assert reduce_dataset([source], out, "polar3d").num_found == 12
-    assert "1 of 12 files were made from other files" in caplog.text
-    assert "such as 2/polar3d_00005.npy: delete these" in caplog.text
-
-
 def test_bad_and_missing_frames_are_found_and_skipped(kradar_root, tmp_path):
     root = reduced_root(kradar_root, tmp_path / "out", "polar3d")
     (root / "2/polar3d_00005.npy").unlink()

@@ -52,40 +52,7 @@ def test_far_objects_come_first_and_hidden_faces_are_omitted():
     assert len([p for p in found if p.box == 0]) <= 9 + len(DETAILS["Sedan"])
 
 
-def test_details_are_painted_on_their_blocks_and_omitted_far_away():
-    near = [12.0, 2.0, -0.1, 4.5, 1.9, 1.5, 0.0]  # we look at its rear
-    colors = [p.color for p in polygons([near], ["Sedan"])]
-    lamp = max(range(len(colors)), key=lambda i: colors[i][0] - colors[i][1])
-    assert colors[lamp][0] > 2 * colors[lamp][1]  # red
-    body = [i for i, c in enumerate(colors) if c[0] == c[1] == c[2]]
-    assert lamp > min(body)
-    far = [shapes._DETAIL_M + 5.0, 2.0, -0.1, 4.5, 1.9, 1.5, 0.0]
-    assert len(polygons([far], ["Sedan"])) <= 9
-
-
 def test_objects_behind_or_outside_the_image_are_omitted():
     behind = [-12.0, 0.0, -0.1, 4.5, 1.9, 1.5, 0.0]
     beside = [5.0, 60.0, -0.1, 4.5, 1.9, 1.5, 0.0]
     assert polygons([behind, beside], ["Sedan", "Sedan"]) == []
-
-
-def test_near_plane_cuts_a_square_in_two():
-    square = np.array([[0.0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0]])
-    cut = shapes._cut_near(square, square[:, 0], 0.5)
-    np.testing.assert_allclose(
-        cut[np.lexsort(cut.T)], [[0.5, 0, 0], [2, 0, 0], [0.5, 1, 0], [2, 1, 0]]
-    )
-
-
-def test_light_by_hand():
-    night = shapes.Light(0.2, np.zeros(3), np.log(2.0) / 10.0, True)
-    color = np.full((1, 3), 100.0)
-    ahead = night.apply(color, np.zeros(1), np.zeros(1), np.full(1, 10.0))
-    np.testing.assert_allclose(ahead, 100.0 * (0.2 + 0.75) / 2.0)
-
-
-def test_haze_halves_contrast_at_its_half_distance():
-    haze = shapes.Light(1.0, np.full(3, 100.0), 0.03, False)
-    color, position = np.array([[200.0, 100.0, 0.0]] * 2), np.zeros(2)
-    seen = haze.apply(color, position, position, np.array([0.0, np.log(2.0) / 0.03]))
-    np.testing.assert_allclose(seen, [[200, 100, 0], [150, 100, 50]])

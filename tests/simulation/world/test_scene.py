@@ -6,20 +6,6 @@ import pytest
 from radejax.simulation.world import scene
 
 
-@pytest.mark.parametrize(
-    ("angle", "expected"), [(np.pi, -np.pi), (3.5 * np.pi, -0.5 * np.pi), (0.3, 0.3)]
-)
-def test_wrap_angle(angle, expected):
-    assert scene.wrap_angle(np.array([angle])) == pytest.approx([expected])
-
-
-def test_points_seen_from_a_turned_ego_by_hand():
-    # At (10, 5), heading left: what is 3 m along +y in the world is 3 m ahead.
-    points = np.array([[10.0, 8.0, 0.5], [9.0, 5.0, 0.0]])
-    seen = scene.turned(points - (10.0, 5.0, 0.0), -np.pi / 2)
-    np.testing.assert_allclose(seen, [[3.0, 0.0, 0.5], [0.0, 1.0, 0.0]], atol=1e-12)
-
-
 class TestOcclusion:
     BOX = np.array([[20.0, 0.0, 0.0, 4.0, 2.0, 2.0, 0.0]])
 
