@@ -353,12 +353,14 @@ def draw(path: pathlib.Path, sequences: Mapping[str, Sides]) -> None:
     help="Training run or exported model. Default: the bundled model.",
 )
 @click.option("--data", type=click.Path(exists=True), help="K-Radar folder, instead.")
+@click.option("--labels", type=click.Path(exists=True), help="Label revision v2.1.")
 @click.option("--out", type=click.Path(path_type=pathlib.Path), default="tracks")
 @click.option("--num-sequences", type=click.IntRange(1), default=4)
 @click.option("--num-frames", type=click.IntRange(2), default=100)
 def main(
     workdir: pathlib.Path,
     data: str | None,
+    labels: str | None,
     out: pathlib.Path,
     num_sequences: int,
     num_frames: int,
@@ -368,7 +370,7 @@ def main(
         entry.set_up_jax()
         detector = Detector.from_workdir(workdir)
         if data is not None:
-            frames = KRadar(data, split="test")
+            frames = KRadar(data, labels, split="test")
         else:
             simulation = detector.saved.config.simulation
             if simulation is None:
