@@ -106,6 +106,7 @@ def run(
         UserError: A field of the config is out of its range, the workdir belongs to a run
             with another configuration or is in use, there are no data, or no space is
             left on the disk.
+        DataError: See `fit`.
         FileNotFoundError: A path does not exist.
     """
     config.check_imports()

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from radejax.losses import gwd as G
 
-# The authors' code has NaN or finite but wrong gradients here (golden/README.md).
+# The authors' code has NaN or finite but wrong gradients here.
 NO_REFERENCE_GRADIENT = {
     "both_square",
     "identical_square",
