@@ -2,6 +2,8 @@
 
 import csv
 import json
+import os
+import pathlib
 import shutil
 from types import SimpleNamespace
 
@@ -25,6 +27,7 @@ from radejax.inference.detect_files import (
     find_inputs,
     front_images,
 )
+from radejax.inference.detector import Detector
 from radejax.models.options import DinoRadeOptions, ImageOptions
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
@@ -120,13 +123,44 @@ def detected(tmp_path_factory):
     detector = small.detector()
     inputs = find_inputs(detector, [folder / "data"])
     for kind in ("json", "kitti", "csv"):
-        detect_files(detector, inputs, folder / kind, batch_size=2, file_format="json")
+        detect_files(detector, inputs, folder / kind, batch_size=2, file_format=kind)
     return detector, folder
 
 
 def _texts(folder):
     paths = [path for path in folder.rglob("*[0-9x].*") if "manifest" not in path.name]
     return {path.relative_to(folder).as_posix(): path.read_text() for path in paths}
+
+
+@pytest.mark.parametrize("file_format", ["json", "kitti", "csv"])
+def test_a_frame_with_a_box_that_is_not_finite_fails(
+    detected, tmp_path, monkeypatch, file_format
+):
+    detector, folder = detected
+    shutil.copytree(folder / "data", tmp_path / "data")
+    inputs = find_inputs(detector, [tmp_path / "data"])
+    out = pathlib.Path(shutil.copytree(folder / file_format, tmp_path / "out"))
+    earlier = sorted(out.rglob("*"))
+    for path in inputs.paths:  # so that they are detected in again
+        os.utime(path, ns=(0, 0))
+
+    def stream(self, frames):
+        for item in frames:
+            found = self(*item) if isinstance(item, tuple) else self(item)
+            yield found.replace(boxes=found.boxes.at[1, 2, 3].set(np.nan))
+
+    monkeypatch.setattr(Detector, "stream", stream)
+    count, failed = detect_files(detector, inputs, out, file_format=file_format)
+    assert count["frames"] == 2
+    assert list(failed) == ["7/00001"]
+    assert "row 2: l of the box is nan" in failed["7/00001"]
+    left = set(earlier) - set(out.rglob("*"))
+    names = {"json": ["7_00001.json"], "kitti": ["000001.txt"], "csv": []}
+    assert [path.name for path in left] == names[file_format]
+    if file_format == "csv":
+        with open(out / "boxes.csv", encoding="utf-8") as file:
+            found = {row["frame"] for row in csv.DictReader(file)}
+        assert found == {"7/00000", "7/00002"}
 
 
 @pytest.mark.parametrize(
@@ -146,17 +180,39 @@ def test_a_file_that_cannot_be_read_fails_alone_and_a_second_call_continues(
     content = inputs.paths[1].read_bytes()
     inputs.paths[1].write_bytes(content[:-7])
     out = tmp_path / "out"
-    count, failed = detect_files(detector, inputs, out, file_format="json")
+    count, failed = detect_files(detector, inputs, out, file_format=kind)
     assert (count["frames"], count["done"], list(failed)) == (2, 0, ["7/00001"])
     assert f"{inputs.paths[1]}: corrupted" in failed["7/00001"]
     expected = _texts(folder / kind)
     assert sorted(expected.keys() - _texts(out)) == lost
     inputs.paths[1].write_bytes(content)
-    count, failed = detect_files(
-        detector, inputs, out, batch_size=2, file_format="json"
-    )
+    count, failed = detect_files(detector, inputs, out, batch_size=2, file_format=kind)
     assert (count["frames"], count["done"], failed) == (3 - done, done, {})
     assert _texts(out) == expected
+
+
+def test_an_image_that_cannot_be_read_fails_alone(tmp_path):
+    detector = small.detector("camera")
+    images = [tmp_path / f"{i}.png" for i in range(3)]
+    for path, image in zip(images, small.images(3), strict=True):
+        Image.fromarray(image).save(path)
+    camera = small.calibration().camera()
+    frames = small.projections(3)
+    inputs = FrameInputs(
+        ["1/0", "1/1", "1/2"],
+        [None] * 3,
+        frames.__getitem__,
+        [(path, camera) for path in images],
+    )
+    images[1].write_bytes(images[1].read_bytes()[:-60])
+    count, failed = detect_files(detector, inputs, tmp_path / "out", batch_size=2)
+    assert (count["frames"], count["radar_only"], list(failed)) == (2, 0, ["1/1"])
+    expected = detector(frames[[0, 2]], small.images(3)[[0, 2]], small.calibration())
+    for name, boxes in zip("02", expected.to_list(), strict=True):
+        rows = json.loads((tmp_path / "out" / f"1_{name}.json").read_text())
+        assert [row["score"] for row in rows] == pytest.approx(
+            [box["score"] for box in boxes], abs=1e-5
+        )
 
 
 @pytest.mark.parametrize(
@@ -170,6 +226,12 @@ def test_a_file_that_cannot_be_read_fails_alone_and_a_second_call_continues(
             "weights",
             r"options\.weights is '\w{16}' there and '\w{16}' here; choose anot",
         ),
+        (
+            "frames",
+            r"options\.frames is \['7/00000', .* there and \['7/00000'\] here; ch",
+        ),
+        ("format", r"options\.format is 'json' there and 'kitti' here"),
+        ("manifest", r"7_0000\d\.json is there, but no manifest\.json"),
     ],
 )
 def test_boxes_of_another_detection_are_not_mixed(detected, tmp_path, change, message):
@@ -181,10 +243,15 @@ def test_boxes_of_another_detection_are_not_mixed(detected, tmp_path, change, me
     elif change == "weights":
         doubled = jax.tree.map(lambda x: 2 * x, detector.variables)
         detector = detector.replace(variables=doubled)
+    elif change == "frames":
+        paths = sorted(folder.rglob("*_00000.npy"))
+    elif change == "manifest":
+        (tmp_path / "out" / "manifest.json").unlink()
     inputs = find_inputs(detector, paths)
+    kind = "kitti" if change == "format" else "json"
     before = _texts(tmp_path / "out")
     with pytest.raises(UserError, match=message):
-        detect_files(detector, inputs, tmp_path / "out", file_format="json")
+        detect_files(detector, inputs, tmp_path / "out", file_format=kind)
     assert _texts(tmp_path / "out") == before
 
 
@@ -205,8 +272,13 @@ def _score(detector, path, num_frames=3):
     ("kind", "removed", "added", "message"),
     [
         ("json", ["7_00001.json"], [], "a partial copy, without 1 of 3 files, such as 7_0"),
+        ("json", ["manifest.*.jsonl", "7_00001.json"], [], "an interrupted job, which did n"),
         ("json", [], ["7_00009.json"], "1 files that are not of the job that wrote the oth"),
+        ("json", ["manifest*", "7_00001.json"], [], "1 of 3 frames have no file, such as 7/"),
         ("kitti", ["preds/000001.txt"], [], "a partial copy, without 1 of 4 files"),
+        ("kitti", ["frames.json"], [], "an interrupted job, .* such as frames.json"),
+        ("kitti", ["manifest*", "preds/*2.txt"], [], "1 of 3 frames have no file, such as 7/"),
+        ("kitti", ["manifest*"], ["preds/000003.txt"], "not the names of all files in preds"),
         ("csv", [], [], "3 of 3 frames have no file"),
     ],
 )  # fmt: skip
@@ -242,6 +314,25 @@ def test_frames_that_failed_are_left_out_and_counted(detected, tmp_path, kind):
         DataError, match="1 of 4 frames have no file, such as 7/00003_0"
     ):
         _score(detector, out, 4)
+
+
+def test_preceding_frames_of_files_are_of_their_sequence(tmp_path):
+    """Frames 7, 8 and 10 of a sequence, and 11 of the next one."""
+    detector = small.detector(num_frames=2)
+    frames = small.projections(4)
+    _write_projections(
+        tmp_path / "data", ("1/00007", "1/00008", "1/00010", "2/00011"), frames
+    )
+    inputs = find_inputs(detector, [tmp_path / "data"])
+    expected = detector(np.stack([frames[[0, 0, 2, 3]], frames], 1)).to_list()
+    for batch_size in (1, 2, 8):
+        out = tmp_path / f"out{batch_size}"
+        count, _ = detect_files(detector, inputs, out, batch_size=batch_size)
+        assert (count["frames"], count["repeated"]) == (4, 3)
+        paths = sorted(out.glob("[12]_*.json"))
+        for path, boxes in zip(paths, expected, strict=True):
+            scores = [box["score"] for box in json.loads(path.read_text())]
+            assert scores == pytest.approx([box["score"] for box in boxes], abs=1e-5)
 
 
 def test_a_frame_after_one_that_cannot_be_read_has_no_preceding_one(tmp_path):
@@ -302,27 +393,3 @@ def test_images_of_simulated_folders_are_found(tmp_path):
     np.testing.assert_array_equal(known[found][1].intrinsics, camera.intrinsics)
     image.unlink()
     assert front_images([path], detector) == {}  # only the radar can be used
-
-
-def test_an_image_that_cannot_be_read_fails_alone(tmp_path):
-    detector = small.detector("camera")
-    images = [tmp_path / f"{i}.png" for i in range(3)]
-    for path, image in zip(images, small.images(3), strict=True):
-        Image.fromarray(image).save(path)
-    camera = small.calibration().camera()
-    frames = small.projections(3)
-    inputs = FrameInputs(
-        ["1/0", "1/1", "1/2"],
-        [None] * 3,
-        frames.__getitem__,
-        [(path, camera) for path in images],
-    )
-    images[1].write_bytes(images[1].read_bytes()[:-60])
-    count, failed = detect_files(detector, inputs, tmp_path / "out", batch_size=2)
-    assert (count["frames"], count["radar_only"], list(failed)) == (2, 0, ["1/1"])
-    expected = detector(frames[[0, 2]], small.images(3)[[0, 2]], small.calibration())
-    for name, boxes in zip("02", expected.to_list(), strict=True):
-        rows = json.loads((tmp_path / "out" / f"1_{name}.json").read_text())
-        assert [row["score"] for row in rows] == pytest.approx(
-            [box["score"] for box in boxes], abs=1e-5
-        )
