@@ -65,7 +65,7 @@ CLAIMS = (
     Claim("attention helps with neck and heads", "3_realistic", "model", "no_cbam", paper=2.39),
     Claim("one stem better than two", "3_realistic", "model", "stem", paper=-0.34),
     Claim("narrow decoder is better", "3", "model", "expand", paper=0.79),
-    Claim("heatmap sigma 0.75 better than 3", "sigma", "sigma 0.75", "sigma 3", "mean"),
+    Claim("heatmap sigma 0.75 better than 3", "sigma_realistic", "sigma 0.75", "sigma 3", "mean"),
     Claim("heatmap sigma 0.75 better than 1", "sigma", "sigma 0.75", "model", "mean"),
     Claim("camera gains 8 points", *_CAMERA, paper=8.64, names_size=True),
     Claim("camera helps", *_CAMERA, "mean"),
