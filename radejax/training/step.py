@@ -411,7 +411,7 @@ def make_train_step(
                 frozen={},
             )
 
-        # `cond` would copy the frozen parameters, which do not change.
+        # The frozen parameters do not change, so `cond` need not return them.
         after = jax.lax.cond(is_finite, update, lambda: state.replace(frozen={}))
         after = after.replace(
             step=state.step + 1,
