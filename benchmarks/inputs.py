@@ -150,7 +150,10 @@ def labeled(records):
     box = np.array([[20.0, 1, 0, 4, 2, 1.5, 0.3]])
     return [
         types.SimpleNamespace(
-            key=key, boxes=np.repeat(box, 5, 0), classes=np.array(["Sedan"] * 5)
+            key=key,
+            boxes=np.repeat(box, 5, 0),
+            classes=np.array(["Sedan"] * 5),
+            columns={},
         )
         for key in sorted(records.keys())
     ]

@@ -6,7 +6,6 @@ import os
 import pathlib
 import subprocess
 import sys
-import types
 
 import pytest
 
@@ -15,25 +14,29 @@ from . import small_models as small
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 
 
-@pytest.fixture
-def modules(monkeypatch: pytest.MonkeyPatch) -> types.SimpleNamespace:
+@pytest.mark.slow  # compiles each stage on its own
+def test_stages_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(ROOT / "benchmarks")
-    import case
-    import page
-    import run
     import stages
 
-    monkeypatch.setattr(run, "SECONDS_A_CASE", 0.05)
-    monkeypatch.setattr(run.rival, "start", lambda platform: None)
-    return types.SimpleNamespace(run=run, page=page, case=case, stages=stages)
-
-
-@pytest.mark.slow  # compiles each stage on its own
-def test_stages_add_up(modules: types.SimpleNamespace) -> None:
-    (row,) = modules.stages.measure(small.detector("camera"), (2,), repeats=1)
-    assert list(row["stages"]) == list(modules.stages.STAGES)
+    (row,) = stages.measure(small.detector("camera"), (2,), repeats=1)
+    assert list(row["stages"]) == list(stages.STAGES)
     assert row["sum_s"] == pytest.approx(sum(row["stages"].values()))
-    assert "batch 2" in modules.stages.as_table([row])
+    assert "batch 2" in stages.as_table([row])
+
+
+@pytest.mark.slow
+def test_benchmarks_are_measured_and_stored(tmp_path: pathlib.Path) -> None:
+    command = [sys.executable, "benchmarks/run.py", "--only", "loader"]
+    subprocess.run(
+        [*command, "--minutes", "0.2", "--out", str(tmp_path)],
+        cwd=ROOT,
+        env={**os.environ, "JAX_PLATFORMS": "cpu"},
+        check=True,
+    )
+    (file,) = tmp_path.glob("*.json")
+    (run,) = json.loads(file.read_text())["runs"]
+    assert run["rows"][0]["name"] == "records to batches"
 
 
 @pytest.mark.slow
