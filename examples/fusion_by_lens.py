@@ -144,7 +144,7 @@ def rows_of_group(name, reports, config, chosen, resamples):
 @click.option(
     "--out",
     type=click.Path(path_type=pathlib.Path),
-    help="JSON file to write. Default: next to FUSION.",
+    help="Folder to write. Default: a folder in FUSION.",
 )
 @click.option(
     "--data", type=click.Path(exists=True), help="Another dataset than the runs'."
@@ -160,6 +160,7 @@ def main(fusion, radar, out, data, split, resamples):
         run = open_model(fusion)
         other = None if data is None else {"roots": (data,)}
         name = "" if other is None else f"_{data_name(other)}"
+        name += "" if split == "test" else f"_{split}"
         config, opened = data_of_run(run, other)
         out = out or fusion / f"by_lens{name}"
         reports = [folder / f"evaluation{name}" for folder in (fusion, radar)]

@@ -20,6 +20,7 @@ from own_radar import get_config as radar_config
 import radejax
 from radejax.cli import entry
 from radejax.config import Config
+from radejax.core import files
 from radejax.core.errors import DataError, require
 from radejax.core.structures import CLASSES as SIMULATED
 from radejax.data.adc import LIGHT_MPS, FmcwRadar, adc_to_power, read_ti_bin
@@ -172,9 +173,11 @@ def main(root, workdir, drives, epochs):
     entry.set_up_jax()
     with entry.exit_codes():
         if not (root / "boxes").exists():
-            simulate(root, drives)
+            with files.swapped_in(root) as folder:  # all drives or none
+                simulate(folder, drives)
         config = get_config().replace(data={"roots": (str(root),)})
         frames = AdcRecordings.from_options(config.data, CLASSES)
+        require(len(frames) > 0, "ROOT", str(root), "a folder with recordings")
         first = frames.part({frame.sequence for frame in frames[:40]}, None)
         levels = echoes_db(first), echoes_db(first, mirrored=True)
         click.echo("echoes at boxes {:.1f} dB, mirrored {:.1f} dB".format(*levels))

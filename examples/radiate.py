@@ -192,6 +192,7 @@ def main(root, calibration, workdir, epochs):
         data = {"roots": (str(root),), "camera_calibration": calibration}
         config = get_config().replace(data=data, train={"num_epochs": epochs})
         frames = Radiate.from_options(config.data, CLASSES)
+        require(len(frames) > 0, "ROOT", str(root), "a folder with sequences")
         frame = max(frames, key=lambda frame: len(frame.boxes))
         scene = radejax.frame_scene(frame, frame.read_projection(GRID), GRID)
         save_figure(radejax.draw_frame(scene), f"{workdir}.png")

@@ -30,7 +30,7 @@ from radejax import Detector
 from radejax.cli import entry
 from radejax.cli.figures import MODEL
 from radejax.core import files
-from radejax.core.errors import UserError
+from radejax.core.errors import UserError, require
 from radejax.data.kradar import Frame, KRadar
 from radejax.evaluation.report import Table, number
 from radejax.geometry.radar_grid import RadarGrid
@@ -371,6 +371,7 @@ def main(
         detector = Detector.from_workdir(workdir)
         if data is not None:
             frames = KRadar(data, labels, split="test")
+            require(len(frames) > 0, "--data", data, "labeled frames of the test split")
         else:
             simulation = detector.saved.config.simulation
             if simulation is None:

@@ -132,8 +132,8 @@ def _training(folder: pathlib.Path) -> bool:
 
 
 def _evaluating(folder: pathlib.Path) -> bool:
-    """Whether an evaluation is running; it writes a temporary folder and moves it when complete."""
-    return any((folder / "run").glob("*evaluation*.tmp"))
+    """Whether an evaluation is running; it writes a temporary folder and moves its content."""
+    return any((folder / "run").glob("evaluation/*.tmp"))
 
 
 @pytest.mark.timeout(1800)

@@ -106,7 +106,11 @@ def simulate(
         if section is None:
             raise UserError(f"{config} has no `simulation` section")
         simulation = section
-    values = dict(simulation) | (FULL_SIZE if full_size else {})
+    values = dict(simulation)
+    if full_size:
+        sizes = {"azimuth_elements", "elevation_elements"}  # of the coarse radar
+        effects = {name: x for name, x in simulation.radar if name not in sizes}
+        values |= FULL_SIZE | {"radar": effects}
     if radar is not None:
         values |= read_object(radar, "grid", "radar")
     values |= {name: value for name, value in fields.items() if value is not None}

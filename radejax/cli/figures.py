@@ -240,6 +240,7 @@ def _open(
         if score_threshold is not None:
             raise UserError("--score-threshold selects detections: give --workdir RUN")
         return entry.read_frames(roots, config, any_visibility=True, **part), None
+    entry.set_up_jax()
     detector = radejax.Detector.from_workdir(workdir, score_threshold=score_threshold)
     settings = detector.saved.config
     is_kradar = find_reader(settings.data.format) is radejax.KRadar

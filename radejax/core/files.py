@@ -75,13 +75,14 @@ def swapped_in(folder: PathLike, *stale: str) -> Iterator[pathlib.Path]:
         DiskFullError: No space is left on the disk.
     """
     folder = as_path(folder)
-    temporary = temporary_path(folder)
-    remove_stale(folder.parent, f".{folder.name}.")
+    is_new = not folder.exists()
+    # In the folder, as its parent may be read-only or on another disk.
+    temporary = temporary_path(folder / "new")
+    remove_stale(folder, ".new.")
     try:
         with disk_full(folder):
             temporary.mkdir()
             yield temporary
-            folder.mkdir(exist_ok=True)
             new = sorted(temporary.iterdir())
             old = {folder / path.name for path in new if (folder / path.name).is_dir()}
             for path in old.union(*map(folder.glob, stale)):
@@ -90,6 +91,8 @@ def swapped_in(folder: PathLike, *stale: str) -> Iterator[pathlib.Path]:
                 path.replace(folder / path.name)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+        if is_new and not any(folder.iterdir()):
+            folder.rmdir()
 
 
 def write_text(path: PathLike, text: str) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import pathlib
+import types
 import zipfile
 from typing import Any
 
@@ -99,6 +100,19 @@ def test_frames_are_checked_preprocessed_and_drawn(
     frames = KRadar(roots, labels, visibility=None)
     (scene,) = figures.viewer_scenes([frames[0]], frames.grid)
     assert scene.image is not None
+
+
+def test_the_full_size_keeps_the_radar_of_the_config(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(
+        "radejax.simulate", lambda options, *_, **__: made.append(options)
+    )
+    radar = {"preset": "ideal", "noise_db": 100.0, "azimuth_elements": 5.0}
+    config = types.SimpleNamespace(simulation=SimulationOptions(radar=radar))
+    monkeypatch.setattr("radejax.load_config", lambda _: config)
+    _run("simulate", "--config", "own", "--full-size", "--out", tmp_path / "out")
+    (options,) = made
+    assert dict(options.radar) == {"preset": "ideal", "noise_db": 100.0}
 
 
 def test_boxes_are_found_in_files_and_arrays(

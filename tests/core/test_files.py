@@ -22,6 +22,19 @@ def test_an_error_leaves_the_old_file_and_nothing_else(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_folder_is_replaced_whole_from_within(tmp_path, monkeypatch):
+    # A mounted folder is on another disk than its parent, which may be read-only.
+    monkeypatch.chdir(tmp_path)
+    with files.swapped_in(".", "old*") as folder:
+        (folder / "a").write_text("1")
+        (tmp_path / "old.txt").touch()
+        assert folder.parent.samefile(tmp_path)
+    with pytest.raises(RuntimeError), files.swapped_in("new") as folder:  # noqa: PT012
+        (folder / "b").touch()
+        raise RuntimeError
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+
+
 @pytest.mark.skipif(not pathlib.Path("/dev/full").exists(), reason="only on Linux")
 def test_a_short_write_of_numpy_is_a_full_disk(tmp_path):
     """NumPy raises an OSError without an error number."""
