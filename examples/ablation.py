@@ -11,6 +11,7 @@
 | sigma | widths of the Gaussians in the heatmap targets |
 | quickstart | the quickstart's input scaling and longer training |
 | camera | the quickstart with and without a camera |
+| augmentation | a random gain in training and none |
 | frames | samples of two consecutive frames and of one |
 | releases | radar tensors and K-Radar's reduced releases, made from the same scenes |
 | polar3d_camera | polar3d with and without a camera |

@@ -198,6 +198,19 @@ STUDIES = {
         ),
         1024,
     ),
+    "augmentation": Study(
+        "a random gain of up to 6 dB in training",
+        "sigma 0.75",
+        {
+            "sigma 0.75": _radar(loss__heatmap_sigma_bins=0.75),
+            "random gain": _radar(loss__heatmap_sigma_bins=0.75, data__random_gain_db=6.0),
+        },
+        (
+            Claim("a random gain helps", "random gain", "sigma 0.75"),
+            Claim("it does in the mean", "random gain", "sigma 0.75", "mean"),
+        ),
+        1024,
+    ),
     "releases": Study(
         "what K-Radar's reduced releases cost",
         "input centered",

@@ -115,7 +115,7 @@ def draw_robustness(_: pathlib.Path) -> Figure:
             fields.setdefault(name.split()[0], []).append(ap)
     figure = new_figure(4.0, 2.5, layout="constrained")
     ax = figure.subplots()
-    for y, (low, high) in enumerate(fields.values()):
+    for y, (low, high, *_) in enumerate(fields.values()):
         ax.plot([low, high], [y, y], color="0.75", lw=2, zorder=1)
         ax.plot(low, y, "o", color=INCONCLUSIVE, label="lowest" if y == 0 else None)
         ax.plot(high, y, "D", color=SUPPORTED, label="highest" if y == 0 else None)
