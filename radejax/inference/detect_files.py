@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-import itertools
 import logging
 import pathlib
 import zlib
@@ -128,8 +127,7 @@ class FrameInputs:
     """Frames in files, as inputs of a detector.
 
     Attributes:
-        keys: Key of every frame, by which its boxes are written. The frames of a sequence
-            follow each other in their order.
+        keys: Key of every frame, by which its boxes are written.
         paths: Radar file of every frame; None if it is not known.
         radar: Function that returns the radar data of a frame, or their file, by position.
         views: Front image and camera of every frame.
@@ -140,14 +138,19 @@ class FrameInputs:
     radar: Callable[[int], Array | PathLike]
     views: Sequence[View]
 
-    def parts(self, num_frames: int) -> list[range]:
-        """Returns the positions of every part of consecutive frames.
+    def parts(self, num_frames: int) -> list[list[int]]:
+        """Returns the positions of every part of consecutive frames, in their order.
 
         Every frame is a part if a sample has one frame.
         """
-        before = frame_histories(self.keys, 2) if num_frames > 1 else {}
-        starts = [i for i, x in enumerate(self.keys) if before.get(x, [x])[0] == x]
-        return [range(*ends) for ends in itertools.pairwise([*starts, len(self.keys)])]
+        if num_frames == 1:
+            return [[index] for index in range(len(self.keys))]
+        positions = {key: index for index, key in enumerate(self.keys)}
+        parts = dict[str, list[int]]()  # by the key of their last frame
+        for before, key in frame_histories(self.keys, 2).values():
+            part = parts[key] = parts.pop(before, [])
+            part.append(positions[key])
+        return list(parts.values())
 
     def read(self, index: int, reader: InputReader) -> _Inputs:
         """Reads the radar data and the image of a frame, and returns its camera too.

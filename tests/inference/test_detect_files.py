@@ -335,6 +335,20 @@ def test_preceding_frames_of_files_are_of_their_sequence(tmp_path):
             assert scores == pytest.approx([box["score"] for box in boxes], abs=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("keys", "parts"),
+    [
+        (["1/10", "1/11", "1/8", "1/9"], [[2, 3, 0, 1]]),
+        (["1/1", "2/1", "1/2", "2/2"], [[0, 2], [1, 3]]),
+        (["1/1", "1/2_a", "1/2_b", "1/3"], [[0, 1], [2, 3]]),
+    ],
+)
+def test_parts_are_consecutive_frames_in_any_order_of_the_keys(keys, parts):
+    inputs = FrameInputs(keys, [], [].__getitem__, [])
+    assert inputs.parts(2) == parts
+    assert inputs.parts(1) == [[0], [1], [2], [3]]
+
+
 def test_a_frame_after_one_that_cannot_be_read_has_no_preceding_one(tmp_path):
     detector = small.detector(num_frames=2)
     frames = small.projections(4)
