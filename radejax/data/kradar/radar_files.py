@@ -57,7 +57,7 @@ def find_frames(
         descriptions = {f: read_description(f / "description.txt") for f in folders}
         folders = {f for f in folders if descriptions[f].weather in weather}
     frames = {
-        (sequence_folder(path), path.stem.removeprefix("DERA_")): path
+        _without_form(path): path
         for path in sorted(found, key=lambda path: (path.suffix == ".npy", path))
         if sequence_folder(path) in folders
     }
@@ -67,6 +67,14 @@ def find_frames(
             f"no frames for {', '.join(asked)}: looked for {' and '.join(PATTERNS)}"
         )
     return sorted(frames.values())
+
+
+def _without_form(path: pathlib.Path) -> pathlib.Path:
+    """Returns a path that is the same for the tensor and the projection of a frame."""
+    folder = path.absolute().parent
+    if folder.name == "DERA_tesseract":
+        folder = folder.with_name("radar_tesseract")
+    return folder / path.stem.removeprefix("DERA_")
 
 
 def sequence_folder(path: pathlib.Path) -> pathlib.Path:

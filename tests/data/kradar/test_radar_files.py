@@ -41,3 +41,11 @@ def test_every_frame_is_found_once_and_its_projection_preferred(tmp_path, monkey
             call()
     with pytest.raises(FileNotFoundError, match="no such file or folder"):
         find_frames([tmp_path / "gone"])
+
+
+def test_frames_of_one_name_in_other_folders_are_all_found(tmp_path):
+    for drive in ("drive1", "drive2"):
+        (tmp_path / drive).mkdir()
+        (tmp_path / drive / "tesseract_00001.mat").touch()
+    files = sorted(tmp_path.glob("*/*.mat"))
+    assert find_frames([tmp_path]) == find_frames(files) == files
