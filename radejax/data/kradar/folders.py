@@ -238,7 +238,7 @@ def find_own_labels(
                 _add_label(found, (number, frame_key(name)), listing[name])
             if names:
                 break
-    return found
+    return dict(sorted(found.items()))
 
 
 def _add_label(found: dict[Key, LabelPath], key: Key, file: LabelPath) -> None:

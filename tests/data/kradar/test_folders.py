@@ -50,6 +50,13 @@ def test_own_labels_by_version(tmp_path, version, folder):
     assert found == {(3, LABEL): tmp_path / f"3/{folder}/{LABEL}.txt"}
 
 
+def test_own_labels_are_in_the_order_of_their_numbers(tmp_path):
+    for name in ("10_7", "9_6"):
+        touch(tmp_path / f"1/info_label/{name}.txt")
+    found = folders.find_own_labels(folders.find_sequences([tmp_path]), "v2.1")
+    assert list(found) == [(1, "00009_00006"), (1, "00010_00007")]
+
+
 @pytest.mark.parametrize(
     "layout",
     [
