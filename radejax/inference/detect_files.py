@@ -27,7 +27,7 @@ from radejax.core.structures import Array, Boxes, Detections
 from radejax.data.cameras import camera_inputs, require_images
 from radejax.data.dataset import FrameSequence, find_reader, read_frames
 from radejax.data.kradar import KRadar
-from radejax.data.kradar.folders import sequence_number
+from radejax.data.kradar.folders import find_labels, find_sequences, sequence_number
 from radejax.data.kradar.radar_files import find_frames, key_of, sequence_folder
 from radejax.data.pipeline import frame_histories
 from radejax.evaluation import kitti
@@ -61,7 +61,7 @@ def front_images(
         detector: Detector of a radar-camera model. The version of the labels is that of
             its config.
         labels: Label revision, see `KRadar`. If None, the label files of the sequences
-            are used, and sequences without them have no images.
+            are used. Sequences without labels have no images.
         camera_calibration: Folder of camera calibrations; None for those in the roots.
         roots: Files and folders in which `find_frames` searched. Folders of sequences
             without radar files may have their images and labels.
@@ -79,8 +79,16 @@ def front_images(
     folders = {sequence_folder(path) for path in paths}
     others -= {folder.parent for folder in folders}
     sequences = {f for f in folders if sequence_number(f) is not None}
-    if not (labels or others):
-        sequences = {f for f in sequences if any(f.glob("info_label*"))}
+    if labels:
+        labeled = {number for number, _ in find_labels(files.as_path(labels))}
+    else:
+        places = sorted({folder.parent for folder in sequences} | others)
+        labeled = {
+            number
+            for number, sequence in find_sequences(places).items()
+            if any(any(folder.glob("info_label*")) for folder in sequence.folders)
+        }
+    sequences = {folder for folder in sequences if int(folder.name) in labeled}
     if not sequences:
         return {}
     frames = KRadar(

@@ -397,6 +397,18 @@ def test_images_of_simulated_folders_are_found(tmp_path):
     assert image.parent.name == "cam-front"
     assert camera.is_valid
 
+    # The images of sequences without labels are not found.
+    tensors = tmp_path / "tensors"
+    paths = [tensors / n / "DERA_tesseract" / path.name for n in (path.parts[-3], "60")]
+    for copy in paths:
+        copy.parent.mkdir(parents=True)
+        shutil.copy(path, copy)
+    for labels, roots in ((root, [tensors]), (None, [tensors, root])):
+        views = front_images(paths, detector, labels, root / "calib", roots)
+        assert views.keys() <= {paths[0]}
+        assert front_images(paths[1:], detector, labels, None, roots) == {}
+    assert views[paths[0]][0] == image
+
     # K-Radar's disks have no camera calibration; its repository does.
     folder = (root / "calib").rename(tmp_path / "repository")
     with pytest.raises(
