@@ -86,8 +86,8 @@ class SavedModel:
             checkpoint.
         usual_input: Mean and standard deviation of the projections that the model was
             trained on; None if they are not known.
-        identity: Name of the run, step, date, commit, versions, data and metrics, as far as
-            they are known.
+        identity: Name of the run, step, date, commit, versions, data, metrics and checksum
+            of the frozen image backbone, as far as they are known.
     """
 
     config: Config
@@ -144,7 +144,7 @@ def load_model(
     Raises:
         FileNotFoundError: There is no model, or no such checkpoint.
         UserError: A step is given, but the path contains one model only; or the backbone
-            is not the one that the run was trained with.
+            is not the one that the run was trained with, or was fine-tuned in the run.
         DataError: A file is corrupted, or config and weights do not fit each other.
     """
     path = files.as_path(path).absolute()
@@ -355,7 +355,8 @@ def _read_checkpoint(path: pathlib.Path, step: Step) -> SavedModel:
             f"{__version__}: train again, or use that version"
         ) from None
     config.check_parts(info["run"].get("parts", {}), folder.parent)
-    identity = _identity(folder.parent, number, info["run"])
+    run = {**info["same"], **info["run"]}
+    identity = _identity(folder.parent, number, run)
     if fit := _calibration(folder.parent, number):
         by_class = fit.pop("classes")
         pairs = [by_class[cls] for cls in config.classes]
@@ -366,7 +367,7 @@ def _read_checkpoint(path: pathlib.Path, step: Step) -> SavedModel:
         RadarGrid.from_dict(info["grid"]),
         {"params": params, **(state.get("model_state") or {})},
         number,
-        {**info["same"], **info["run"]},
+        run,
         info["run"].get("input"),
         identity,
     )
@@ -401,7 +402,7 @@ def _identity(workdir: pathlib.Path, step: int, run: JsonObject) -> JsonObject:
             names = ("data", "split", "num_frames")
             metrics = {"evaluation": evaluation, **{n: found[n] for n in names}}
             metrics["ap"] = aps
-    wanted = ("date", "commit", "radejax_commit", "versions", "data")
+    wanted = ("date", "commit", "radejax_commit", "versions", "data", FROZEN_BACKBONE)
     known = {name: run[name] for name in wanted if name in run}
     is_seed = workdir.name.startswith("seed")  # of `run_seeds`
     name = "/".join(workdir.parts[-2:]) if is_seed else workdir.name
@@ -479,12 +480,22 @@ def _with_backbone(saved: SavedModel, given: PathLike | None) -> SavedModel:
 
     They are read from the given file or folder, else from the one that the run was
     trained with, else from the weights that the run started from.
+
+    Raises:
+        UserError: The given weights are not those that the model was trained with, or
+            would replace fine-tuned ones.
     """
     params = saved.variables["params"]
     config = saved.config
     is_complete = IMAGE_BACKBONE in params and given is None
     if is_complete or not isinstance(config.model, DinoRadeOptions):
         return saved
+    if IMAGE_BACKBONE in params and not config.model.image.freeze:
+        raise UserError(
+            f"image_backbone is {given}, but the model has a fine-tuned image backbone "
+            "(config.model.image.freeze is False): leave image_backbone out "
+            "(--image-backbone)"
+        )
     source = given or config.data.image_backbone
     start = saved.run.get("init_from")
     found: VariableDict | None = None
@@ -503,7 +514,7 @@ def _with_backbone(saved: SavedModel, given: PathLike | None) -> SavedModel:
             source,
         )
         return saved
-    if (sha256 := saved.run.get(FROZEN_BACKBONE)) is not None:
+    if (sha256 := saved.identity.get(FROZEN_BACKBONE)) is not None:
         image_backbone.check_same_backbone(backbone, sha256, source)
     params = {**params, IMAGE_BACKBONE: backbone}
     return dataclasses.replace(saved, variables={**saved.variables, "params": params})

@@ -26,7 +26,7 @@ from radejax.inference.saved import (
 )
 from radejax.runs import experiment
 from radejax.training.checkpoints import Checkpoints
-from radejax.weights import radenet_torch
+from radejax.weights import image_backbone, radenet_torch
 
 from .. import small_models as small
 
@@ -170,6 +170,35 @@ def test_an_exported_camera_model_is_without_dinov3(tmp_path):
     assert loaded.camera_options == detector.camera_options
     with pytest.raises(UserError, match="--with-backbone"):
         save_model(small.saved("camera", model__image__freeze=False), tmp_path)
+
+
+def test_another_backbone_than_that_of_the_training_is_rejected(tmp_path, monkeypatch):
+    saved = small.saved("camera")
+    params = dict(saved.variables["params"])
+    own = params.pop("image_backbone")
+    statistics = {"batch_stats": saved.variables["batch_stats"]}
+    found = {"own": own, "other": jax.tree.map(lambda x: x + 1, own)}
+    load = lambda path, model: {"params": {"image_backbone": found[path]}}  # noqa: E731
+    monkeypatch.setattr(image_backbone, "load_image_backbone", load)
+    same = {saved_models.FROZEN_BACKBONE: image_backbone.weights_sha256(own)[:16]}
+    info = experiment.checkpoint_info(saved.config, saved.grid, {}, same)
+    positions = iter(grain.MapDataset.range(9).to_iter_dataset())
+    run, exported, tuned = (tmp_path / name for name in ("run", "exported", "tuned"))
+    state = {"params": params, "model_state": statistics}
+    with Checkpoints(run / "checkpoints") as checkpoints:
+        checkpoints.save(1, state, positions, info=info)
+    save_model(load_model(run), exported)
+    for folder in (run, exported):
+        params = load_model(folder, image_backbone="own").variables["params"]
+        assert params["image_backbone"] is own
+        with pytest.raises(UserError, match="other is not the image backbone that was"):
+            load_model(folder, image_backbone="other")
+    config = saved.config.replace(model={"image": {"freeze": False}})
+    save_model(dataclasses.replace(saved, config=config), tuned, with_backbone=True)
+    with pytest.raises(
+        UserError, match="own, but the model has a fine-tuned image back"
+    ):
+        load_model(tuned, image_backbone="own")
 
 
 def test_a_flipped_bit_of_the_weights_is_found(tmp_path):
