@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import stat
 import time
 from collections.abc import Iterable
 
@@ -66,6 +67,9 @@ def reduce_dataset(
     manifest.warn_of_changes(out, done)
     for root in paths:
         shutil.copytree(root, out, False, _LEFT_OUT, _link, dirs_exist_ok=True)
+        for made, *_ in os.walk(out):  # those of a write-protected root are so too
+            if not (mode := os.stat(made).st_mode) & stat.S_IWUSR:
+                os.chmod(made, mode | stat.S_IWUSR)
     is_axis_up = is_elevation_axis_up(paths)
     skipped = {}
     for path in tqdm(missing, "reduce", unit="frame"):

@@ -83,6 +83,18 @@ def test_writing_resumes_and_lists_corrupted_tensors(kradar_root, tmp_path):
         reduce_dataset([source], source, "rpc")
 
 
+def test_folders_of_a_write_protected_root_are_written_to(kradar_root, tmp_path):
+    source = shutil.copytree(kradar_root, tmp_path / "in")
+    second = shutil.copytree(source / "2", tmp_path / "second" / "2").parent
+    for root in (source, second):
+        for folder in (root, *root.glob("**/")):
+            folder.chmod(0o555)
+    out = tmp_path / "out"
+    assert reduce_dataset([source, second], out, "polar3d").num_written == 12
+    assert {folder.stat().st_mode & 0o777 for folder in out.glob("**/")} == {0o755}
+    assert source.stat().st_mode & 0o777 == 0o555
+
+
 def test_bad_and_missing_frames_are_found_and_skipped(kradar_root, tmp_path):
     root = reduced_root(kradar_root, tmp_path / "out", "polar3d")
     (root / "2/polar3d_00005.npy").unlink()
