@@ -171,12 +171,20 @@ def test_records_of_other_files_or_of_another_reader_are_reported(
     (root / "1" / "0002.npz").touch()
     assert "1 of 4 files were made from other files than there are now" in again()
     assert "such as 1/0002: delete these" in caplog.text
+    # The files of the first frames were moved.
+    frames = _read_toy(root)
+    gone = [replace(frames[0], radar_path=None)]
+    gone += [replace(frames[1], radar_path=root / "gone.npz")]
+    data = toy.Toy([*gone, *frames[2:]], frames.grid)
+    assert preprocess(data, tmp_path / "records").num_found == 4
     read = toy.ToyFrame.read_projection
     mirrored = lambda frame, grid: read(frame, grid)[:, ::-1]  # noqa: E731
     with monkeypatch.context() as patch:
         patch.setattr(toy.ToyFrame, "read_projection", mirrored)
         with pytest.raises(UserError, match=r"1/0001 is not what the reader computes"):
             again()
+        with pytest.raises(UserError, match=r"2/0001 is not what the reader computes"):
+            preprocess(data, tmp_path / "records")
     monkeypatch.setattr(reader, "reader_version", "2")
     with pytest.raises(
         UserError, match=r"other records: options.source.reader is \['toy:Toy', ''"

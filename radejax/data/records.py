@@ -382,8 +382,13 @@ def _check(records: Records, frames: FrameSequence) -> None:
     _log.info("%d records in %s are used", len(frames), records.folder)
     sources = {frame.key: frame.radar_path for frame in frames}
     changed = set(manifest.warn_of_changes(records.folder, sources))
-    same = [frame for frame in frames if frame.key not in changed]
-    for frame in same[: "reader" in records.source]:
+    # Files may be missing, as records suffice for a training.
+    same = (
+        frame
+        for frame in frames
+        if frame.key not in changed and manifest.state_of([frame.radar_path])
+    )
+    for frame in itertools.islice(same, "reader" in records.source):
         now = encode(frame.read_projection(records.grid), records.dtype)
         if not np.allclose(decode(now), decode(records[frame.key]), atol=0.01):
             raise UserError(
