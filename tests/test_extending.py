@@ -26,8 +26,10 @@ from radejax.data.dataset import LabeledFrames, find_reader
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.check import check_dataset
 from radejax.data.options import DataOptions
+from radejax.data.pipeline import make_table
 from radejax.data.projection import project_tensor
 from radejax.data.records import Records, preprocess
+from radejax.evaluation.boxes import tables_from_frames
 from radejax.inference.detect_files import detect_files, find_inputs
 from radejax.inference.detector import Detector
 from radejax.inference.export import export
@@ -285,6 +287,26 @@ def test_what_a_reader_forgets_is_named(
     counts = toy.Toy(uncalibrated, grid).with_valid_boxes(classes).counts
     name = "frames with a camera_path and no camera_calibration_path: read_calibration "
     assert counts[f"{name}is not called"] == 1
+
+    # Frames without objects may have arrays of any type and shape.
+    none = np.array([])
+    empty = replace(frames[0], boxes=none, classes=none, columns={"velocity_mps": none})
+    data = toy.Toy([empty, *frames[1:], replace(empty, name="0009")], grid)
+    data = data.with_valid_boxes(classes)
+    preprocess(data, tmp_path / "records")
+    records, targets = Records.open(tmp_path / "records"), ("velocity_mps",)
+    table = make_table(records, data, max_objects=2, classes=classes, targets=targets)
+    assert table.boxes.shape == (5, 2, 8)
+    assert table.targets["velocity_mps"].shape == (5, 2, 2)
+    truth, _ = tables_from_frames(data, None, targets)
+    assert truth.extras["velocity_mps"].shape == (len(truth), 2)
+    for fields, message in (
+        ({"boxes": np.zeros((2, 6))}, r"1/0001: shape of boxes is \(2, 6\), expected"),
+        ({"boxes": np.zeros(7)}, r"1/0001: shape of boxes is \(7,\), expected \(N, 7"),
+        ({"classes": np.array(["Sedan"] * 9)}, r"1/0001: shape of classes is \(9,\), "),
+    ):
+        with pytest.raises(UserError, match=message):
+            toy.Toy([replace(frames[0], **fields)], grid).with_valid_boxes(classes)
 
     # Labels without z and height.
     flat = replace(frames[0], boxes=np.array([[12.0, 1.0, 4.2, 1.8, 0.1]]))

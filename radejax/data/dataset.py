@@ -127,10 +127,15 @@ class LabeledFrame:
     is_simulated: bool = False
 
     def __post_init__(self) -> None:
-        boxes = np.asarray(self.boxes)
-        if boxes.ndim == 2 and boxes.shape[1] == 5:
+        boxes, classes = np.asarray(self.boxes), np.asarray(self.classes)
+        if not boxes.size:  # np.array([]) has other shapes and types
+            boxes = np.zeros((0, 7))
+        elif boxes.ndim == 2 and boxes.shape[1] == 5:
             boxes = np.insert(boxes, (2, 4), _BEV_Z_AND_HEIGHT_M, axis=1)
-            object.__setattr__(self, "boxes", boxes)
+        if not classes.size:
+            classes = np.zeros(0, str)
+        object.__setattr__(self, "boxes", boxes)
+        object.__setattr__(self, "classes", classes)
 
     @property
     def key(self) -> str:
@@ -357,8 +362,8 @@ class LabeledFrames(Sequence[_F]):
             classes: Classes to detect.
 
         Raises:
-            UserError: Frames have the same key, yaws are in degrees, or a column has not one
-                row per box.
+            UserError: Frames have the same key, boxes are of another shape, yaws are in
+                degrees, or classes or a column have not one row per box.
         """
         keys = collections.Counter(frame.key for frame in self)
         for key, number in keys.most_common(1):
@@ -367,8 +372,14 @@ class LabeledFrames(Sequence[_F]):
         counts = collections.Counter[str]()
         frames: list[LabeledFrame] = []
         for frame in self:
-            boxes = np.asarray(frame.boxes, np.float64).reshape(-1, 7)
+            boxes = np.asarray(frame.boxes, np.float64)
             names = np.asarray(frame.classes)
+            what = f"frame {frame.key}: shape of boxes"
+            expected = "(N, 7): x, y, z, l, w, h, yaw; or (N, 5): x, y, l, w, yaw"
+            require(boxes.shape[1:] == (7,), what, boxes.shape, expected)
+            what = f"frame {frame.key}: shape of classes"
+            expected = f"({len(boxes)},), one name per box"
+            require(names.shape == (len(boxes),), what, names.shape, expected)
             others = set(names.tolist()).difference(classes)
             reasons = {f"class {name!r}": names == name for name in sorted(others)} | {
                 "a value is not finite": ~np.isfinite(boxes).all(axis=1),

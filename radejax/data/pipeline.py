@@ -171,6 +171,8 @@ def make_table(
     columns = {name: _empty_column(frames, name, shape) for name in targets}
     for i, frame in enumerate(frames):
         rows = np.flatnonzero(kept[i])
+        if not rows.size:
+            continue  # columns of frames without objects may have another shape
         boxes[i, : len(rows)] = boxes8_from_7(frame.boxes[rows])
         indices[i, : len(rows)] = [class_index[frame.classes[row]] for row in rows]
         for name in columns.keys() & frame.columns.keys():
@@ -183,12 +185,10 @@ def _empty_column(
     frames: FrameSequence, name: str, shape: tuple[int, int]
 ) -> Float[np.ndarray, "F N ..."]:
     """Returns a column of the objects of all frames without known values."""
-    columns = {
-        key: column
-        for frame in frames
-        for key, column in frame.columns.items()
-        if column.dtype.kind in "biuf"
-    }
+    # The last frame counts, as columns of frames without objects may have another shape.
+    ordered = sorted(frames, key=lambda frame: len(frame.boxes))
+    columns = {key: x for frame in ordered for key, x in frame.columns.items()}
+    columns = {key: x for key, x in columns.items() if x.dtype.kind in "biuf"}
     known = ", ".join(sorted(columns)) or "they have none"
     expected = f"a column of numbers of the labels: {known}"
     require(name in columns, "config.data.targets", name, expected)

@@ -345,10 +345,10 @@ def tables_from_frames(
 def _joined(frames: Sequence[LabeledFrame], name: str) -> Float[np.ndarray, "N ..."]:
     """Returns a column of the objects of all frames, NaN in frames without it."""
     found = [frame.columns[name] for frame in frames if name in frame.columns]
-    inner = found[0].shape[1:] if found else ()
+    inner = max(found, key=len).shape[1:] if found else ()
     parts = [
         np.asarray(frame.columns[name], np.float64)
-        if name in frame.columns
+        if name in frame.columns and len(frame.boxes)  # others may have another shape
         else np.full((len(frame.boxes), *inner), np.nan)
         for frame in frames
     ]
