@@ -104,8 +104,8 @@ def run(
 
     Raises:
         UserError: A field of the config is out of its range, the workdir belongs to a run
-            with another configuration or is in use, there are no data, or no space is
-            left on the disk.
+            with another configuration or other starting weights or is in use, there are no
+            data, or no space is left on the disk.
         DataError: See `fit`.
         FileNotFoundError: A path does not exist.
     """
@@ -134,6 +134,8 @@ def run(
         pretrained = with_pretrained(part, pretrained or {})
 
     with claimed(folder, config):
+        info = run_info(folder, init_from, init_partial)
+
         # Data -------------------------------------------------------------------------
 
         data = open_data(config)
@@ -145,7 +147,6 @@ def run(
                 "no frames of the test split in %s: the run is trained and not evaluated",
                 ", ".join(data.options.roots),
             )
-        info = run_info(folder, init_from, init_partial)
         info |= {"input": data.usual_input, "data": data.describe()}
         info |= {"parts": config.own_parts()}
         if (before := folder / "run.json").exists():
@@ -467,6 +468,9 @@ def run_info(
         init_from: Weights that the run starts from. If None, the entry of an existing
             `run.json` is kept.
         init_partial: Model whose weights are used where they match; as `init_from`.
+
+    Raises:
+        UserError: The workdir has checkpoints of a run that started from other weights.
     """
     path = workdir / "run.json"
     before = files.read_object(path) if path.exists() else {}
@@ -475,6 +479,14 @@ def run_info(
         name: before.get(name) if one is None else str(files.as_path(one).absolute())
         for name, one in given.items()
     }
+    for name in given if any(workdir.glob("checkpoints/*")) else ():
+        if start[name] != before.get(name):
+            raise UserError(
+                f"--{name.replace('_', '-')} is {start[name]}, expected "
+                f"{before.get(name) or 'none'} as at the start of the run, because "
+                f"{files.relative(workdir)} has checkpoints from which it continues: leave "
+                "it out, or give another --workdir"
+            )
     versions = {"radejax": __version__, "jax": jax.__version__}
     return {
         **start,

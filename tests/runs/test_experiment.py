@@ -204,6 +204,21 @@ def test_what_a_run_started_from_is_kept(tmp_path: pathlib.Path) -> None:
     assert again["init_from"] == info["init_from"]
 
 
+def test_a_run_with_checkpoints_takes_no_other_weights(tmp_path: pathlib.Path) -> None:
+    first = tmp_path / "a.pth"
+    info = experiment.run_info(tmp_path, first)
+    (tmp_path / "run.json").write_text(json.dumps(info))
+    # As long as nothing is trained, the folder takes other weights.
+    experiment.run_info(tmp_path, tmp_path / "b.pth")
+    (tmp_path / "checkpoints" / "1").mkdir(parents=True)
+    assert experiment.run_info(tmp_path, first)["init_from"] == str(first)
+    assert experiment.run_info(tmp_path)["init_from"] == str(first)
+    with pytest.raises(UserError, match=r"--init-from is .*b\.pth, expected .*a\.pth"):
+        experiment.run_info(tmp_path, tmp_path / "b.pth")
+    with pytest.raises(UserError, match=r"--init-partial is .*, expected none as"):
+        experiment.run_info(tmp_path, first, first)
+
+
 def test_commit_and_own_parts_of_a_run_are_stored(
     tmp_path: pathlib.Path,
     monkeypatch: pytest.MonkeyPatch,
