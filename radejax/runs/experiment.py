@@ -46,7 +46,7 @@ from radejax.core.structures import Batch
 from radejax.core.version import __version__, commit, radejax_commit
 from radejax.data.dataset import FrameSequence
 from radejax.data.records import open_embeddings
-from radejax.evaluation.report import Table, number, numbers, write_tables
+from radejax.evaluation.report import Report, Table, number, numbers, write_tables
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.saved import (
     FROZEN_BACKBONE,
@@ -109,9 +109,33 @@ def run(
         DataError: See `fit`.
         FileNotFoundError: A path does not exist.
     """
+    folder = files.as_path(workdir).absolute()
+    _run(
+        config,
+        folder,
+        init_from=init_from,
+        init_partial=init_partial,
+        profile=profile,
+        mesh=mesh,
+    )
+    return folder
+
+
+def _run(
+    config: Config,
+    folder: pathlib.Path,
+    *,
+    init_from: PathLike | None = None,
+    init_partial: PathLike | None = None,
+    profile: PathLike | None = None,
+    mesh: Mesh | None = None,
+) -> tuple[bool, Report | None]:
+    """Does the work of `run`; returns whether the training is finished, and the report.
+
+    The report is None without a test split, and on all processes except the first.
+    """
     config.check_imports()
     config = located(config)
-    folder = files.as_path(workdir).absolute()
     mesh = devices.make_mesh() if mesh is None else mesh
     devices.check_batch_size(config.train.batch_size, mesh)
 
@@ -191,10 +215,11 @@ def run(
         step = int(state.step)
         if not is_finished:
             _log.info("stopped at step %d; run the same command to continue", step)
-            return folder
+            return False, None
 
         # Report -----------------------------------------------------------------------
 
+        report = None
         if has_test:
             others = evaluation("validation") if config.data.validation else None
             report = evaluation("test").report(
@@ -214,7 +239,7 @@ def run(
         best = f"radejax evaluate {place} --checkpoint best"
         split = data.choosing_split
         _log.info("Best checkpoint, chosen on the %s split: %s", split, best)
-    return folder
+    return True, report
 
 
 # Training ----------------------------------------------------------------------------
@@ -555,8 +580,8 @@ def run_seeds(
 
     Returns:
         The absolute path of the workdir. Its files `seeds.json`, `seeds.txt`,
-        `seeds.md` and `seeds.tex` contain the mean and standard deviation over the finished
-        seeds.
+        `seeds.md` and `seeds.tex` contain the mean and standard deviation over the seeds
+        that are finished and evaluated.
 
     Raises:
         UserError: Two seeds are equal, or `run` raises it.
@@ -566,17 +591,19 @@ def run_seeds(
     tables = {}
     for seed in seeds:
         _log.info("seed %d of %s", seed, list(seeds))
-        folder = run(config.replace(seed=seed), workdir / f"seed{seed}", **options)
-        metrics = folder / "evaluation" / "metrics.csv"
-        if not metrics.exists():
-            _log.info("seed %d is not evaluated: it is not finished, or no data", seed)
+        folder = workdir / f"seed{seed}"
+        is_finished, report = _run(config.replace(seed=seed), folder, **options)
+        if not is_finished:
             break
+        if report is None:  # no test split, or not the main process
+            continue
+        metrics = folder / "evaluation" / "metrics.csv"
         tables[str(seed)] = {
             tuple(row[key] for key in _KEYS): float(row["ap"] or "nan")
             for row in csv.DictReader(files.read_text(metrics).splitlines())
             if float(row["num_gt"])
         }
-    if tables and devices.is_main():
+    if tables:
         _write_summary(workdir, tables)
     return workdir
 
@@ -587,7 +614,7 @@ def _write_summary(
     """Writes mean, standard deviation and values of the APs that all seeds have.
 
     The standard deviation is the sample standard deviation with n - 1, and None for one
-    seed.
+    seed. If there is no such AP, a warning is logged instead.
 
     Args:
         workdir: Folder of `seeds.json`, `seeds.txt`, `seeds.md` and `seeds.tex`.
@@ -608,6 +635,9 @@ def _write_summary(
             line = row["cls"], terms, row["space"].upper(), row["iou"]
             mean = f"{number(row['mean'])} ± {number(row['std'])}"
             lines.append([*line, mean, *numbers(aps)])
+    if not rows:
+        _log.warning("no summary of %s: no class has objects in every seed", workdir)
+        return
     title = f"AP, mean ± standard deviation over {len(tables)} seeds, all weathers"
     header = ["Class", "Protocol", "AP", "IoU", "Mean", *(f"Seed {x}" for x in tables)]
     table = Table(title, header, lines, "seeds")

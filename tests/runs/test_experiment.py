@@ -251,7 +251,7 @@ def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
     aps = {0: 50.0, 1: 53.0, 2: 59.0}
     seen = []
 
-    def run(config: Any, workdir: pathlib.Path, *, init_from: str) -> pathlib.Path:
+    def run(config: Any, workdir: pathlib.Path, *, init_from: str) -> Any:
         seen.append((config.seed, workdir.name, init_from))
         (workdir / "evaluation").mkdir(parents=True)
         (workdir / "evaluation" / "metrics.csv").write_text(
@@ -260,9 +260,9 @@ def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
             + "b/simulated,all_point,0.05,all,Bicycle,3d,0.3,,0\n"
             + f"c/simulated,all_point,0.05,rain,Sedan,3d,0.3,{config.seed},3\n"
         )
-        return workdir
+        return True, object()
 
-    monkeypatch.setattr(experiment, "run", run)
+    monkeypatch.setattr(experiment, "_run", run)
     experiment.run_seeds(Config(), tmp_path / "runs", range(3), init_from="w")
     assert seen == [(i, f"seed{i}", "w") for i in range(3)]
     rows = json.loads((tmp_path / "runs" / "seeds.json").read_text())
@@ -273,3 +273,38 @@ def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
     message = r"--seeds is \(1, 2, 1\), expected different seeds"
     with pytest.raises(UserError, match=message):
         experiment.run_seeds(Config(), tmp_path, (1, 2, 1))
+
+
+@pytest.mark.parametrize(
+    ("is_finished", "is_evaluated", "expected"),
+    [
+        (False, False, [0]),  # by a signal
+        (True, False, [0, 1, 2]),  # without a test split
+        (True, True, [0, 1, 2]),
+    ],
+)
+def test_only_an_unfinished_seed_ends_the_seeds_and_old_reports_do_not_count(
+    tmp_path: pathlib.Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    is_finished: bool,
+    is_evaluated: bool,
+    expected: list[int],
+) -> None:
+    started = []
+
+    def run(config: Any, workdir: pathlib.Path) -> Any:
+        started.append(config.seed)
+        (workdir / "evaluation").mkdir(parents=True)
+        num_gt = 0 if is_evaluated else 10
+        (workdir / "evaluation" / "metrics.csv").write_text(
+            "name,protocol,score_threshold,condition,cls,space,iou,ap,num_gt\n"
+            f"a,all_point,0.05,all,Sedan,3d,0.3,50,{num_gt}\n"
+        )
+        return is_finished, object() if is_evaluated else None
+
+    monkeypatch.setattr(experiment, "_run", run)
+    experiment.run_seeds(Config(), tmp_path, range(3))
+    assert started == expected
+    assert not (tmp_path / "seeds.json").exists()
+    assert ("no class has objects in every seed" in caplog.text) == is_evaluated
