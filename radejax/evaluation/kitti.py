@@ -95,7 +95,7 @@ def write_kitti(
             "preds": "\n".join(found.get(position, [DUMMY])) + "\n",
             "desc": "\n".join(tags.get(kind, "unknown") for kind in DESCRIPTION),
         }
-        for tag in ("all", *tags.values()):
+        for tag in {"all", *tags.values()}:  # tags may be equal, such as "unknown"
             listed.setdefault(root / tag, []).append(f"{position:06d}")
             for kind, text in texts.items():
                 path = root / tag / kind / f"{position:06d}.txt"

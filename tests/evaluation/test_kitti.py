@@ -58,6 +58,14 @@ def test_round_trip_gives_the_same_results(tmp_path):
     assert len(part) == (FRAMES["weather"][TRUTH["frame"]] == "fog").sum()
 
 
+def test_a_frame_with_equal_tags_is_listed_once(tmp_path):
+    unknown = dict.fromkeys(kitti.DESCRIPTION, np.full(12, "unknown"))
+    kitti.write_kitti(tmp_path, TRUTH, FOUND, {**FRAMES, **unknown})
+    parts = (tmp_path / "0.0" / part for part in ("all", "unknown"))
+    listed, again = ((part / "val.txt").read_text() for part in parts)
+    assert listed == again
+
+
 def test_score_threshold_and_dummy_lines(tmp_path):
     kitti.write_kitti(tmp_path, TRUTH, FOUND, FRAMES, score_threshold=0.5)
     assert [p.name for p in tmp_path.iterdir()] == ["0.5"]
