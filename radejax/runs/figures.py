@@ -202,9 +202,9 @@ def draw_compared(
     for name, folder in zip(short_names(paths), folders, strict=True):
         _, found, table, _ = load(folder, source, options.classes)
         assert found.score is not None
-        runs[name] = found.take(found.score > OPERATING_SCORE)
-    ids = {key: i for key, i in ids_by_name(table).items() if key in frames}
-    evaluated = [frames[key] for key in ids]
+        # Ids differ if a run was evaluated on a part of the frames.
+        runs[name] = found.take(found.score > OPERATING_SCORE), ids_by_name(table)
+    evaluated = [frames[key] for key in ids_by_name(table) if key in frames]
     for weather, index in fullest_of_weathers(evaluated).items():
         frame = evaluated[index]
         if records:
@@ -225,7 +225,7 @@ def draw_compared(
                 score_threshold=OPERATING_SCORE,
                 title=f"{name}: {weather} ({frame.key}){suffix}",
             )
-            for name, found in runs.items()
+            for name, (found, ids) in runs.items()
         ]
         save_figure(draw_scenes(scenes), out_dir / f"scenes_{weather}.{ending}")
 

@@ -13,6 +13,10 @@ from radejax.cli.main import main
 from radejax.config import load_config
 from radejax.core.structures import NARROW_ROI, Boxes
 from radejax.data.kradar import KRadar
+from radejax.evaluation.boxes import tables_from_frames
+from radejax.evaluation.files import Source
+from radejax.evaluation.report import write_report
+from radejax.evaluation.results import ReportOptions
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.runs import figures
 from radejax.runs.figures import draw_training_samples
@@ -134,3 +138,24 @@ def test_compared_runs_are_drawn_side_by_side(
         assert other.title.startswith("few.json: ")
         assert one.matches is not None
         assert (one.matches.ground_truth != 0).all()  # all is found
+
+
+def test_a_run_with_other_frame_ids_is_drawn_with_its_own(
+    root: pathlib.Path, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frames = list(KRadar([root]))
+    options = ReportOptions(roi=None, plots=False, protocols=("all_point",))
+    paths = tmp_path / "all", tmp_path / "part"
+    for path, chosen in zip(paths, (frames, frames[1:]), strict=True):
+        truth, table = tables_from_frames(chosen)
+        found = dataclasses.replace(truth, score=np.full(len(truth), 0.9))
+        write_report(truth, found, table, path, options)
+    drawn: list[list[Scene]] = []
+    monkeypatch.setattr(figures, "draw_scenes", drawn.append)
+    monkeypatch.setattr(figures, "save_figure", lambda *_: None)
+    source = Source(data=(str(root),), sequences=(frames[1].sequence,))
+    figures.draw_compared(paths, tmp_path, source, options, "png")
+    assert len(drawn) == 1
+    for scene in drawn[0]:
+        assert scene.predictions is not None
+        np.testing.assert_allclose(scene.predictions.box, frames[1].boxes)
