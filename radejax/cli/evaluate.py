@@ -262,10 +262,14 @@ def compare(
     score` takes them. With three seeds or more of both runs, differences are tested.
 
     Example: radejax compare runs/a runs/b
+    Without --protocols, all_point and kradar_r40 are compared.
     """
     from radejax.evaluation.comparison import compare_files
 
-    source, settings = _settings(runs[0], _given(options), bootstrap=2000)
+    given = _given(options)
+    source, settings = _settings(runs[0], given, bootstrap=2000)
+    if "protocols" not in given:  # more rows would make the correction for them larger
+        settings = settings.replace(protocols=settings.main_protocols[:2])
     if figures and out is None:
         raise UserError("--figures needs a folder: give --out FOLDER")
     text, rows = compare_files(runs, out, source, settings, figures=figures)

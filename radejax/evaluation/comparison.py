@@ -138,9 +138,9 @@ def compare(
         run_a: Evaluation sets of run A.
         run_b: Evaluation sets of run B with the same ground truth and frames.
         frames: Frame table with the column sequence.
-        options: Settings of the evaluation. The first two main protocols are compared
-            over all frames, and `all_point` by weather and distance, at the first IoU
-            threshold.
+        options: Settings of the evaluation. `all_point` and the protocols of the options
+            are compared over all frames, and `all_point` by weather and distance, at the
+            first IoU threshold.
         spaces: "bev", "3d" or both.
 
     Raises:
@@ -153,7 +153,8 @@ def compare(
     rows = []
     iou = options.iou_thresholds[0]
     for kind, condition, chosen, sequence in _parts(sets, frames, iou):
-        names = options.main_protocols[:2] if kind == "all" else [protocols.RECOMMENDED]
+        others = options.protocols if kind == "all" else ()
+        names = dict.fromkeys((protocols.RECOMMENDED, *others))
         num_sequences = np.unique(sequence).size
         # The first row counts every frame once, which gives the APs over all frames.
         weights = np.ones((1, sequence.size), np.int16)

@@ -233,6 +233,22 @@ def test_predictions_in_files_are_compared(stored, scene, write_table):
     assert json.loads(done.stdout) == rows
 
 
+def test_named_protocols_are_compared_besides_all_point(stored):
+    folder, source = stored
+    path = str(folder / "found.json")
+    words = ["compare", path, path, "--ground-truth", source.ground_truth]
+    words += ["--bootstrap", "2", "--roi", "none", "--json"]
+    for named, expected in (
+        ([], {"all_point", "kradar_r40"}),
+        (["--protocols", "voc11,auc"], {"all_point", "voc11", "auc"}),
+    ):
+        done = CliRunner().invoke(main, [*words, *named])
+        rows = json.loads(done.stdout)
+        assert {row["protocol"] for row in rows if row["kind"] == "all"} == expected
+        others = {row["protocol"] for row in rows if row["kind"] != "all"}
+        assert others == {"all_point"}
+
+
 def test_frames_are_compared_by_key(scene, tmp_path):
     """A run was evaluated on a part of the frames only, which have other ids there."""
     truth, found, frames = scene
