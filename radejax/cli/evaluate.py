@@ -10,6 +10,7 @@ import click
 
 from radejax.cli import entry
 from radejax.cli.entry import several, together
+from radejax.core import files
 from radejax.core.errors import UserError
 
 if TYPE_CHECKING:
@@ -220,7 +221,8 @@ def score(
     from radejax.evaluation.files import evaluate_files
     from radejax.evaluation.results import name_of_changes
 
-    path = pathlib.Path(predictions)
+    path = pathlib.Path(predictions).absolute()  # as the folder "." has no name
+    stem = path.name if path.is_dir() else path.stem
     given = _given(options)
     source, settings = _settings(predictions, given, bootstrap=200)
     usual_source, usual_settings = _settings(predictions, {}, bootstrap=200)
@@ -229,8 +231,8 @@ def score(
     names = given.keys() - {"data", "labels", "ground_truth"}
     changes = {name: value for name, value in given.items() if name in names}
     end = f"_evaluation{name_of_changes(changes, usual)}"
-    folder = out or path.with_name(f"{path.stem}{end}")
-    report = evaluate_files(path, folder, source, settings, run=name or path.stem)
+    folder = out or files.relative(path.with_name(f"{stem}{end}"))
+    report = evaluate_files(predictions, folder, source, settings, run=name or stem)
     entry.echo_result(as_json, report.metrics, f"{report.text}\nWritten to {folder}")
 
 
@@ -260,9 +262,9 @@ def compare(
 
     Each is the folder of a run, of its seeds or of a report, or predictions as `radejax
     score` takes them. With three seeds or more of both runs, differences are tested.
+    Without --protocols, all_point and kradar_r40 are compared.
 
     Example: radejax compare runs/a runs/b
-    Without --protocols, all_point and kradar_r40 are compared.
     """
     from radejax.evaluation.comparison import compare_files
 

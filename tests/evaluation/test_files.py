@@ -235,6 +235,19 @@ def test_options_of_a_report_or_of_the_config_of_a_run(stored, two_runs):
     assert list(files.report_folders(two_runs / "a")) == ["seed0", "seed1", "seed2"]
 
 
+def test_results_of_a_folder_are_named_after_it(two_runs, tmp_path, monkeypatch):
+    names = ("lr0.001", "lr0.002")
+    for name in names:
+        shutil.copytree(two_runs / "a" / "seed0" / "evaluation", tmp_path / name)
+    monkeypatch.chdir(tmp_path / names[1])
+    for place in (f"../{names[0]}", "."):
+        done = CliRunner().invoke(main, ["score", place, "--bootstrap", "0"])
+        assert done.exit_code == 0, done.output
+    for name in names:
+        metrics = tmp_path / f"{name}_evaluation" / "metrics.json"
+        assert json.loads(metrics.read_text())["run"] == name
+
+
 def test_scoring_a_run_repeats_its_report(two_runs, tmp_path):
     run = two_runs / "a" / "seed0"
     words = ["score", str(run), "--out", str(tmp_path), "--bootstrap", "0"]
