@@ -295,13 +295,16 @@ def stored_options(path: PathLike) -> JsonObject:
     """Returns the options of the first report of a run.
 
     Without a report, they are the classes of the config in the folder or its parent, or
-    none without a config.
+    none without a config that has them: other programs write files of this name, too.
     """
-    place = next(iter(report_folders(path).values()))
+    place = next(iter(report_folders(path).values())).absolute()
     found: JsonObject = {}
     for config in (place.parent / "config.json", place / "config.json"):
         if config.is_file():
-            found = {"classes": files.read_object(config, "classes")["classes"]}
+            content = files.read_object(config)
+            for values in (content, content.get("config")):  # of a run, of an export
+                if isinstance(values, dict) and isinstance(values.get("classes"), list):
+                    found = {"classes": values["classes"]}
     if any((place / name).is_file() for name in ("metrics.json", "predictions.npz")):
         found = files.read_object(place / "metrics.json", "options")["options"]
     return {name: as_tuples(value) for name, value in found.items()}

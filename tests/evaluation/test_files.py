@@ -235,6 +235,16 @@ def test_options_of_a_report_or_of_the_config_of_a_run(stored, two_runs):
     assert list(files.report_folders(two_runs / "a")) == ["seed0", "seed1", "seed2"]
 
 
+def test_a_config_of_another_program_has_no_classes(stored):
+    folder, _ = stored
+    for text, expected in (
+        ('{"model_type": "dinov3_vit"}', {}),
+        ('{"config": {"classes": ["Sedan"]}}', {"classes": ("Sedan",)}),
+    ):
+        (folder / "config.json").write_text(text)
+        assert files.stored_options(folder / "found.json") == expected
+
+
 def test_results_of_a_folder_are_named_after_it(two_runs, tmp_path, monkeypatch):
     names = ("lr0.001", "lr0.002")
     for name in names:
