@@ -82,6 +82,15 @@ def test_keys_survive_another_selection_of_frames(tmp_path, write_table):
     np.testing.assert_array_equal(read.frame, found["frame"] + 1000)
 
 
+def test_further_columns_of_numbers_are_kept(tmp_path):
+    _, found, frames = random_scene(2)
+    further = {"probability": found["score"] / 2, "grid": np.ones(3)}
+    np.savez(tmp_path / "p.npz", **found, **further)
+    read = files.read_table(tmp_path / "p.npz", frames)
+    assert list(read.extras) == ["probability"]
+    np.testing.assert_array_equal(read.extras["probability"], found["score"] / 2)
+
+
 NAMED = {"frame": np.array([10, 11]), "name": np.array(["1/a", "1/b"])}
 RECORD = {"frame": "1/b", "cls": "Sedan", "box": BOX, "score": 0.5}
 
