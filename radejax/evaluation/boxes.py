@@ -208,17 +208,18 @@ def frame_ids(frames: AnyColumns) -> Int[np.ndarray, " F"]:
 
 
 def class_indices(
-    boxes: Boxes, classes: Sequence[str], name: str
+    boxes: Boxes, classes: Sequence[str], name: str, known: Sequence[str] = ()
 ) -> Int[np.ndarray, " N"]:
-    """Returns the index of each box into `classes`, or -1 for K-Radar's other classes.
+    """Returns the index of each box into `classes`, or -1 for other known classes.
 
     Args:
         boxes: Boxes with class names.
         classes: Classes that are evaluated.
         name: Name of the table for the error message.
+        known: Known classes besides these and K-Radar's.
 
     Raises:
-        DataError: A class name is neither evaluated nor one of K-Radar's.
+        DataError: A class name is neither evaluated nor known.
 
     Examples:
         >>> box = np.ones((2, 7))
@@ -226,7 +227,7 @@ def class_indices(
         >>> class_indices(boxes, ["Sedan"], "ground truth").tolist()
         [0, -1]
     """
-    index_of = dict.fromkeys(KNOWN_CLASSES, -1)
+    index_of = dict.fromkeys((*KNOWN_CLASSES, *known), -1)
     index_of |= {name: i for i, name in enumerate(classes)}
     names, inverse = np.unique(boxes.cls, return_inverse=True)
     index = np.array([index_of.get(n, -2) for n in names.tolist()], np.int64)[inverse]

@@ -40,7 +40,13 @@ from radejax.evaluation.boxes import (
     take,
 )
 from radejax.evaluation.evaluation_set import SPACES, EvaluationSet
-from radejax.evaluation.files import Source, load, report_folders, stored_options
+from radejax.evaluation.files import (
+    Source,
+    known_classes,
+    load,
+    report_folders,
+    stored_options,
+)
 from radejax.evaluation.results import (
     LEVEL,
     ReportOptions,
@@ -375,7 +381,11 @@ def compare_files(
     # Predictions below the lowest stored score of one run must not count for another run.
     seeds = [seed for run in folders for seed in run.values()]
     stored = (stored_options(seed).get("min_score", 0) for seed in seeds)
-    options = options.replace(min_score=max(options.min_score, *stored))
+    known = known_classes(*seeds, source.ground_truth)
+    options = options.replace(
+        min_score=max(options.min_score, *stored),
+        known_classes=tuple(sorted(known.union(options.known_classes))),
+    )
     names = [str(path) for path in paths]
     first, frames = _load_run(folders[0], source, options)
     others = [_load_run(run, source, options, frames) for run in folders[1:]]

@@ -168,8 +168,12 @@ class EvaluationSet:
         frames: AnyColumns | None = None,
         roi: Roi = None,
         label_version: str | None = None,
+        known: Sequence[str] = (),
     ) -> None:
-        """Creates an evaluation set; see `evaluate` for the arguments."""
+        """Creates an evaluation set; see `evaluate` for the arguments.
+
+        `known` are further classes of the boxes, which are not evaluated.
+        """
         self.classes = tuple(classes)
         is_unique = len(set(self.classes)) == len(self.classes) > 0
         is_valid = is_unique and not isinstance(classes, str)
@@ -187,6 +191,7 @@ class EvaluationSet:
         self.frame = boxes.frame_ids(frames)
         self.is_simulated = bool(np.any(frames.get("simulated", False)))
         self._roi = roi
+        self._known = known
         self.left_out: dict[str, int] = {}
         self.gt, self._gt_row = self._select(truth, "ground truth")
         self.pred, self._pred_row = self._select(found, "predictions")
@@ -215,7 +220,7 @@ class EvaluationSet:
         The other boxes are counted in `left_out`.
         """
         position = boxes.frame_positions(table.frame, self.frame, name)
-        cls = boxes.class_indices(table, self.classes, name)
+        cls = boxes.class_indices(table, self.classes, name, self._known)
         is_class = cls >= 0
         is_inside = boxes.in_roi(table.box, self._roi)
         num_outside = int((is_class & ~is_inside).sum())

@@ -201,10 +201,10 @@ def load(
         DataError: A file has malformed content.
     """
     path = files.as_path(path)
+    known = known_classes(path, source.ground_truth).union(boxes.KNOWN_CLASSES)
     if (path / "predictions.npz").is_file():
         source = source.replace(ground_truth=str(path / "ground_truth.npz"))
         path = path / "predictions.npz"
-    known = {*boxes.KNOWN_CLASSES, *stored_options(path).get("classes", ())}
     truth, given, left_out = _load_ground_truth(path, source, classes)
     known |= set(truth.cls.tolist())
     expected = f"some of {', '.join(sorted(known))}"
@@ -317,6 +317,13 @@ def stored_options(path: PathLike) -> JsonObject:
     return {name: as_tuples(value) for name, value in found.items()}
 
 
+def known_classes(*paths: PathLike | None) -> set[str]:
+    """Returns the classes of runs and reports, evaluated or not."""
+    stored = [stored_options(path) for path in paths if path]
+    fields = ("classes", "known_classes")
+    return {cls for one in stored for field in fields for cls in one.get(field, ())}
+
+
 def _read_frames(path: PathLike) -> Columns:
     """Reads a frame table that `report.write_report` wrote."""
     content = files.read_json(path)
@@ -353,6 +360,10 @@ def evaluate_files(
             f"{path} has only predictions from score {low:g} on, and every number is of "
             "these; `radejax evaluate` with --min-score stores lower ones"
         )
-    options = options.replace(min_score=max(low, options.min_score))
+    known = known_classes(path, source.ground_truth)
+    options = options.replace(
+        min_score=max(low, options.min_score),
+        known_classes=tuple(sorted(known.union(options.known_classes))),
+    )
     origin = Origin(run, left_out=left_out, warnings=warnings)
     return write_report(truth, found, frames, out_dir, options, origin)

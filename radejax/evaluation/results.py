@@ -146,6 +146,9 @@ class ReportOptions(EvaluationOptions):
     """Region of interest of ground truth and predictions."""
     classes: tuple[str, ...] = CLASSES
     """Classes to evaluate."""
+    known_classes: tuple[str, ...] = ()
+    """Further classes of the data, whose boxes are not evaluated unless they are in
+    `classes`."""
     label_version: str | None = None
     """Label revision of the ground truth."""
     invalid_sizes: Literal["error", "false_positive"] = "error"
@@ -235,6 +238,7 @@ def make_set(
         frames=frames,
         roi=options.roi,
         label_version=options.label_version,
+        known=options.known_classes,
     )
     data.left_out |= {
         "predictions: size not positive, kept as false positives": num_invalid,

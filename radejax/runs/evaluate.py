@@ -405,6 +405,7 @@ def report_options(config: Config, **changes: Any) -> ReportOptions:
     has_versions = find_reader(config.data.format).has_label_versions
     own = {
         "classes": config.classes,
+        "known_classes": config.classes,
         "label_version": config.data.label_version if has_versions else None,
         "invalid_sizes": "false_positive",
         **dict(config.evaluation),

@@ -11,6 +11,7 @@ from radejax.core.errors import DataError, UserError
 from radejax.data.kradar import KRadar
 from radejax.evaluation import boxes, files, kitti
 from radejax.evaluation.files import Source
+from radejax.evaluation.report import write_report
 from radejax.evaluation.results import ReportOptions
 
 from ..data.conftest import write_kradar
@@ -252,6 +253,26 @@ def test_a_config_of_another_program_has_no_classes(stored):
     ):
         (folder / "config.json").write_text(text)
         assert files.stored_options(folder / "found.json") == expected
+
+
+def test_own_classes_that_are_not_chosen_are_known(scene, tmp_path):
+    *tables, frames = scene
+    tables = [
+        {**x, "cls": np.where(x["cls"] == "Sedan", "Car", "Tram")} for x in tables
+    ]
+    options = ReportOptions(
+        roi=None, plots=False, protocols=("all_point",), classes=("Car", "Tram")
+    )
+    part = options.replace(classes=("Car",), known_classes=options.classes)
+    for name, of in (("all", options), ("part", part)):
+        write_report(*tables, frames, tmp_path / name, of)
+    for words in (
+        ("score", tmp_path / "all", "--classes", "Tram"),
+        ("score", tmp_path / "part", "--classes", "Tram"),
+        ("compare", tmp_path / "part", tmp_path / "all"),
+    ):
+        done = CliRunner().invoke(main, [*map(str, words), "--bootstrap", "2"])
+        assert done.exit_code == 0, done.stderr
 
 
 def test_results_of_a_folder_are_named_after_it(two_runs, tmp_path, monkeypatch):

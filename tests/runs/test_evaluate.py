@@ -102,6 +102,7 @@ def test_changes_replace_what_the_config_says() -> None:
     options = report_options(Config(), **changes, classes=("Sedan",))
     assert (options.protocols, options.min_score) == (("auc",), 0.2)
     assert (options.roi, options.classes) == (None, ("Sedan",))
+    assert options.known_classes == Config().classes
     with pytest.raises(UserError, match="'Tram', expected some of the run's: Sed"):
         report_options(Config(), classes=("Tram",))
 
