@@ -24,7 +24,7 @@ from radejax.data.kradar import KRadar
 from radejax.evaluation import boxes
 from radejax.evaluation.boxes import Columns, column_names, columns_of_boxes
 from radejax.evaluation.kitti import find_root, read_kitti
-from radejax.evaluation.report import Origin, Report, write_report
+from radejax.evaluation.report import Origin, Report, warn_of_replaced, write_report
 from radejax.evaluation.results import ReportOptions
 
 LOW_SCORE = 0.1
@@ -366,4 +366,5 @@ def evaluate_files(
         known_classes=tuple(sorted(known.union(options.known_classes))),
     )
     origin = Origin(run, left_out=left_out, warnings=warnings)
+    warn_of_replaced(files.as_path(out_dir), run)
     return write_report(truth, found, frames, out_dir, options, origin)

@@ -23,6 +23,7 @@ import datetime
 import importlib.resources
 import itertools
 import json
+import logging
 import pathlib
 import re
 import types
@@ -54,6 +55,8 @@ from radejax.evaluation.results import (
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+_log = logging.getLogger(__name__)
 
 STALE = ("kitti", "precision_recall_*", "reliability.*", "thresholds.*")
 """Patterns of the names of what only some reports contain."""
@@ -97,6 +100,14 @@ class Origin(NamedTuple):
 
 
 UNKNOWN = Origin()
+
+
+def warn_of_replaced(folder: pathlib.Path, run: str) -> None:
+    """Warns if a folder has a report of another run."""
+    if (before := folder / "metrics.json").exists():
+        other = files.read_object(before).get("run")
+        if other != run:
+            _log.warning("%s: the results of %s are replaced", folder, other)
 
 
 def write_report(

@@ -42,7 +42,13 @@ from radejax.evaluation.boxes import (
 )
 from radejax.evaluation.evaluation_set import EvaluationSet, Result
 from radejax.evaluation.html import SceneFigure
-from radejax.evaluation.report import STALE, Origin, Report, write_report
+from radejax.evaluation.report import (
+    STALE,
+    Origin,
+    Report,
+    warn_of_replaced,
+    write_report,
+)
 from radejax.evaluation.results import (
     ReportOptions,
     compute_results,
@@ -240,10 +246,7 @@ class Evaluation:
         others = None if choosing is None else choosing._matched(variables)
         place = out or workdir / "evaluation"
         name = run or workdir.name
-        if (before := place / "metrics.json").exists():
-            other = files.read_object(before).get("run")
-            if other != name:
-                _log.warning("%s: the results of %s are replaced", place, other)
+        warn_of_replaced(place, name)
 
         def write() -> Report:
             with files.swapped_in(place, *_STALE, *STALE) as folder:

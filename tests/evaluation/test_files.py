@@ -357,7 +357,7 @@ def test_reports_mixed_by_a_partial_copy_are_rejected(two_runs, tmp_path, name):
     )
 
 
-def test_a_report_replaces_all_of_an_earlier_one(stored):
+def test_a_report_replaces_all_of_an_earlier_one(stored, caplog):
     folder, source = stored
     out = folder / "out"
     for is_on in (True, False):
@@ -368,6 +368,9 @@ def test_a_report_replaces_all_of_an_earlier_one(stored):
         assert any(name.startswith("precision_recall_") for name in names) == is_on
         (out / "notes.txt").touch()
     assert "notes.txt" in names
+    assert "are replaced" not in caplog.text
+    files.evaluate_files(folder / "found.json", out, source, options, run="other")
+    assert f"{out}: the results of radejax are replaced" in caplog.text
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["radejax"] == radejax.__version__
 
