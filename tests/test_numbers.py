@@ -87,6 +87,13 @@ def _robustness_rows() -> Iterator[str]:
         if name in (ideal := stored["trained on ideal"]["ap"]):
             aps.append(ideal[name])
         yield f"{field} {_row(aps)}"
+    models = stored["augmentation"]["ap"].values()
+    for name in next(iter(models)):
+        row = _row(ap[name] for ap in models if name in ap)
+        yield from (
+            f"{name} {row}",
+            f"{name.split()[0]} {row}",
+        )  # whole numbers are no APs
 
 
 def _calibration_rows() -> Iterator[str]:

@@ -289,8 +289,8 @@ def _scene(
 def demo(out: pathlib.Path, seed: int) -> None:
     """Simulate one frame, detect its objects with a bundled model and draw the result.
 
-    Only this package is needed. The model is that of the quickstart: it was trained on
-    simulated frames of a coarse radar, not on K-Radar's.
+    Only this package is needed. The model is that of a longer quickstart: it was trained
+    on simulated frames of a coarse radar, not on K-Radar's.
 
     Example: radejax demo --out demo.png
     """
