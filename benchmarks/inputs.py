@@ -308,6 +308,10 @@ def onnx_session(path):
     import onnxruntime  # an optional dependency, in the extra "onnx"
 
     session = onnxruntime.InferenceSession(path)
-    settings = {"score_threshold": 0.0, "nms_iou": 0.3, "roi": [-1e9, 1e9] * 3}
+    settings = {
+        "score_threshold": [0.0] * len(CLASSES),
+        "nms_iou": 0.3,
+        "roi": [-1e9, 1e9] * 3,
+    }
     given = {name: np.asarray(x, np.float32) for name, x in settings.items()}
     return lambda projection: session.run(None, given | {"projection": projection})
