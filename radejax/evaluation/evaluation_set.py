@@ -343,13 +343,21 @@ class EvaluationSet:
         return np.lexsort((self._pred_row, -self.score))
 
     @_cached
+    def _by_class(self, threshold: float) -> list[Int[np.ndarray, " _"]]:
+        """Returns the predictions of each class above a threshold, by descending score."""
+        pred = self.by_score[self.score[self.by_score] > threshold]
+        cls = self.pred.cls[pred]
+        return [pred[cls == index] for index in range(len(self.classes))]
+
+    @_cached
     def _pooled_rankings(
         self, geometry: str, rule: str, space: str, iou: float, threshold: float
     ) -> list[Ranking]:
         """Returns the predictions of each class, which count if they match an object."""
         is_tp = self.matched_objects(geometry, rule, space, iou) >= 0
         # A threshold of 0 also keeps scores of 0.
-        return self._ranked(self.by_score, is_tp[self.by_score], threshold or -1.0)
+        by_class = self._by_class(threshold or -1.0)
+        return [self._ranking(pred, is_tp[pred]) for pred in by_class]
 
     @_cached
     def _kradar_rankings(
@@ -362,7 +370,7 @@ class EvaluationSet:
         found = matching.match_kradar(pairs, self.score, self.gt_group, iou)
         matched = self._ranked(found.first_pred, 1, threshold)
         events = self._ranked(found.event_pred, found.event_delta, threshold)
-        every = self._ranked(self.by_score, 1, threshold)
+        every = [self._ranking(pred, 1) for pred in self._by_class(threshold)]
         return list(zip(matched, events, every, strict=True))
 
     def _ranked(
@@ -376,10 +384,12 @@ class EvaluationSet:
         rankings = []
         for cls in range(len(self.classes)):
             rows = is_kept & (self.pred.cls[pred] == cls)
-            mine = pred[rows]
-            ranking = Ranking(self.score[mine], self.pred.frame[mine], value[rows])
-            rankings.append(ranking)
+            rankings.append(self._ranking(pred[rows], value[rows]))
         return rankings
+
+    def _ranking(self, pred: Int[np.ndarray, " K"], value: ArrayLike) -> Ranking:
+        value = np.broadcast_to(value, pred.shape)
+        return Ranking(self.score[pred], self.pred.frame[pred], value)
 
     # Results -------------------------------------------------------------------------
 
