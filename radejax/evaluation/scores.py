@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
-from scipy.optimize import minimize
 from scipy.special import expit, logit
 
 from radejax.evaluation.evaluation_set import EvaluationSet
@@ -147,6 +146,8 @@ def fit_calibration(
         >>> calibrated(score[::500], *fit_calibration(score, is_matched)).round(2).tolist()
         [0.2, 0.8]
     """
+    from scipy.optimize import minimize  # slow to import, and only needed here
+
     num = is_matched.sum()
     target = np.where(is_matched, (num + 1) / (num + 2), 1 / (score.size - num + 2))
     levels = logit(np.clip(score, 1e-6, 1 - 1e-6))
