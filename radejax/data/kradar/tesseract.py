@@ -174,8 +174,7 @@ def read_frame(path: PathLike, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
     """
     if pathlib.Path(path).suffix != ".npy":
         whole = project_file(path, shape_drea=grid.shape_drea)
-        projection: np.ndarray = grid.measured_channels(whole)
-        return projection
+        return grid.measured_channels(whole)
     if reduced.is_reduced_file(path):
         return reduced.project_reduced(read_npy(path, mapped=True), grid, str(path))
     projection = read_projection_npy(path, projection_shape=grid.projection_shape)
