@@ -18,7 +18,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Float
 
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import PathLike, as_path
@@ -81,11 +81,6 @@ class Frame(LabeledFrame):
     tesseract_path: pathlib.Path | None
     projection_path: pathlib.Path | None
     ego_speed_mps: float | None = None
-
-    @property
-    def visibility(self) -> Shaped[np.ndarray, " N"]:
-        """Visibility flags of `boxes`."""
-        return self.columns["visibility"]
 
     def read_projection(self, grid: RadarGrid) -> np.ndarray:
         """Reads the float32 projection, see `tesseract.read_frame`."""
@@ -529,7 +524,7 @@ def select(
     boxes = np.concatenate([np.zeros((0, 7)), *(frame.boxes for frame in frames)])
     text = np.zeros(0, np.str_)
     classes = np.concatenate([text, *(frame.classes for frame in frames)])
-    flags = np.concatenate([text, *(frame.visibility for frame in frames)])
+    flags = np.concatenate([text, *(frame.columns["visibility"] for frame in frames)])
     is_known = np.isin(flags, VISIBILITY_FLAGS)
     is_kept = np.ones(len(boxes), bool)
     rules = {"class": np.isin(classes, list(options.classes))}
