@@ -27,7 +27,6 @@ from radejax.data.dataset import LabeledFrame, LabeledFrames, Summary
 from radejax.data.kradar import conditions, folders, motion
 from radejax.data.kradar.labels import (
     LABEL_CLASSES,
-    VERSIONS,
     VISIBILITY_FLAGS,
     Key,
     Label,
@@ -643,10 +642,7 @@ class KRadar(LabeledFrames[Frame]):
             options: The section `config.data`.
             classes: Classes to detect.
         """
-        version = options.label_version
-        is_version = f"v{version.removeprefix('v')}" in VERSIONS
-        expected = f"one of {', '.join(VERSIONS)}"
-        require(is_version, "config.data.label_version", version, expected)
+        normalize_version(options.label_version)
         _require_known("config.data.weather", options.weather, conditions.WEATHERS)
         visibility = options.visibility or ()
         _require_known("config.data.visibility", visibility, VISIBILITY_FLAGS)
