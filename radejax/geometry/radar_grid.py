@@ -147,11 +147,9 @@ class RadarGrid(ArrayValues):
     def __post_init__(self) -> None:
         for name, least in _LEAST_BINS.items():
             axis = self.freeze(name)
-            if axis.ndim != 1 or axis.size < least:
-                raise UserError(
-                    f"{name} must be a vector of at least {least} bins, got shape "
-                    f"{axis.shape}"
-                )
+            is_vector = axis.ndim == 1 and axis.size >= least
+            expected = f"one axis of at least {least} bins"
+            require(is_vector, f"shape of {name}", axis.shape, expected)
             is_angle = name.endswith("_rad")
             limit = np.pi if is_angle else _MAX_VALUE
             if not (np.abs(axis) <= limit).all():
@@ -177,9 +175,8 @@ class RadarGrid(ArrayValues):
             value = getattr(self, name)
             limit = np.pi if name.endswith("_rad") else _MAX_VALUE
             limit = min(limit, 2 * np.abs(getattr(self, name[len("fov_") :])).max())
-            if not 0 < value <= limit:
-                message = f"positive, to {limit:g} for its axis, got {value}"
-                raise UserError(f"{name} must be {message}")
+            expected = f"a number above 0, to {limit:g} for its axis"
+            require(0 < value <= limit, name, float(value), expected)
 
     # Construction --------------------------------------------------------------------
 
