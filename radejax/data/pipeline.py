@@ -205,10 +205,8 @@ class LoaderOptions:
         shuffle: Whether every epoch has a new random order; otherwise the frames are
             drawn in the order of the table.
         num_epochs: Number of epochs, or None to repeat without end.
-        drop_remainder: Whether to leave out the last, smaller batch of an epoch.
         pad_remainder: Whether to fill the last, smaller batch of an epoch with empty
-            frames of index -1 instead, so that all processes have the same number of
-            batches.
+            frames of index -1, instead of leaving it out.
         num_threads: Number of threads that read frames, or None for one per CPU that
             the process may use; 0 reads them in the calling thread.
         process_index: Index of this process, or None for that of JAX.
@@ -219,7 +217,6 @@ class LoaderOptions:
     seed: int = 0
     shuffle: bool = True
     num_epochs: int | None = None
-    drop_remainder: bool = True
     pad_remainder: bool = False
     num_threads: int | None = None
     process_index: int | None = None
@@ -249,7 +246,7 @@ def make_loader(
 
     Raises:
         UserError: There are fewer frames than one batch of all processes, and the
-            remainder is dropped and not padded.
+            remainder is not padded.
     """
     num_threads = options.num_threads
     if num_threads is None:
@@ -298,7 +295,7 @@ def _make_order(
     total = num_frames
     if options.pad_remainder:
         total = -(-num_frames // rows) * rows
-    elif options.drop_remainder:
+    else:
         check_enough(num_frames, options.batch_size, count)
     # grain shuffles epoch e of seed s in the same way as epoch e - 1 of seed s + 1. The
     # seed is therefore hashed, so that runs with consecutive seeds have unrelated orders.
@@ -307,9 +304,7 @@ def _make_order(
     if options.shuffle:
         dataset = dataset.shuffle(seed=int(spread[1]))
     seeded: grain.MapDataset[np.ndarray] = dataset.random_map(_add_seed)
-    batches = seeded.batch(
-        rows, drop_remainder=options.drop_remainder, batch_fn=np.stack
-    )
+    batches = seeded.batch(rows, drop_remainder=True, batch_fn=np.stack)
     # Every process takes its own rows of each global batch, so that the frames of a
     # training step and their order do not depend on the number of processes.
     if count == 1:
