@@ -364,18 +364,14 @@ class _LoadBatch(grain.transforms.Map):
     def _sample(self, index: int) -> Sample:
         """Returns the sample of one frame."""
         table = self._table
-        images = self._table.images
-        projection = read_sample(table.records, table.keys[index])
-        sample = Sample(
-            projection,
-            table.boxes[index],
-            table.classes[index],
+        images = table.images
+        return Sample(
+            projection=read_sample(table.records, table.keys[index]),
+            boxes=table.boxes[index],
+            classes=table.classes[index],
+            image=None if images is None else images.image(index),
+            camera=None if images is None else images.cameras[index],
             targets={name: values[index] for name, values in table.targets.items()},
-        )
-        if images is None:
-            return sample
-        return dataclasses.replace(
-            sample, image=images.image(index), camera=images.cameras[index]
         )
 
     def _empty(self, size: int) -> Batch:
