@@ -300,10 +300,7 @@ class CameraCalibration(ArrayValues):
             DataError: A line is not `key: number`, a key is missing or a value is out of
                 range. The message names the file.
         """
-        path = as_path(path)
-        if not path.is_file():
-            raise FileNotFoundError(f"camera calibration {path} does not exist")
-        values = _read_numbers(path)
+        values = _read_numbers(as_path(path))
         if missing := [key for key in _KEYS if key not in values]:
             raise DataError(f"{path}: camera calibration lacks {', '.join(missing)}")
         yaw, pitch, roll = (values[key] for key in _ANGLES)
