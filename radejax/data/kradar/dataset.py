@@ -524,7 +524,7 @@ def select(
     text = np.zeros(0, np.str_)
     classes = np.concatenate([text, *(frame.classes for frame in frames)])
     flags = np.concatenate([text, *(frame.columns["visibility"] for frame in frames)])
-    is_known = np.isin(flags, VISIBILITY_FLAGS)
+    is_odd = ~np.isin(flags, VISIBILITY_FLAGS)
     is_kept = np.ones(len(boxes), bool)
     rules = {"class": np.isin(classes, list(options.classes))}
     rules["visibility"] = rules["field of view"] = is_kept
@@ -532,9 +532,8 @@ def select(
         rules["visibility"] = np.isin(flags, list(options.visibility))
     if options.field_of_view:
         rules["field of view"] = grid.in_field_of_view(*boxes[:, :2].T)
-    counts = collections.Counter(
-        {"objects with an odd availability flag": int((~is_known).sum())}
-    )
+    counts = collections.Counter[str]()
+    counts["objects with an odd availability flag"] = int(is_odd.sum())
     for rule, passes in rules.items():
         counts[f"objects left out by {rule}"] = int((is_kept & ~passes).sum())
         is_kept = is_kept & passes
