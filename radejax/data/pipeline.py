@@ -209,8 +209,8 @@ class LoaderOptions:
             frames of index -1, instead of leaving it out.
         num_threads: Number of threads that read frames, or None for one per CPU that
             the process may use; 0 reads them in the calling thread.
-        process_index: Index of this process, or None for that of JAX.
-        process_count: Number of processes, or None for that of JAX.
+        process_index: Index of this process, by default that of JAX.
+        process_count: Number of processes, by default that of JAX.
     """
 
     batch_size: int
@@ -219,8 +219,8 @@ class LoaderOptions:
     num_epochs: int | None = None
     pad_remainder: bool = False
     num_threads: int | None = None
-    process_index: int | None = None
-    process_count: int | None = None
+    process_index: int = dataclasses.field(default_factory=jax.process_index)
+    process_count: int = dataclasses.field(default_factory=jax.process_count)
 
 
 def make_loader(
@@ -288,9 +288,6 @@ def _make_order(
     """
     index = options.process_index
     count = options.process_count
-    if index is None or count is None:
-        index = jax.process_index()
-        count = jax.process_count()
     rows = options.batch_size * count
     total = num_frames
     if options.pad_remainder:
