@@ -286,7 +286,6 @@ def _make_order(
 
     Frame indices of `num_frames` and above are padding.
     """
-    index = options.process_index
     count = options.process_count
     rows = options.batch_size * count
     total = num_frames
@@ -304,9 +303,7 @@ def _make_order(
     batches = seeded.batch(rows, drop_remainder=True, batch_fn=np.stack)
     # Every process takes its own rows of each global batch, so that the frames of a
     # training step and their order do not depend on the number of processes.
-    if count == 1:
-        return batches
-    return batches.map(lambda rows: np.array_split(rows, count)[index])
+    return batches.map(lambda rows: np.array_split(rows, count)[options.process_index])
 
 
 def _add_seed(frame: int, rng: np.random.Generator) -> Int[np.ndarray, "2"]:
