@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 import pathlib
 import time
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -16,8 +14,6 @@ from radejax.core.errors import DataError, UserError
 from radejax.core.files import read_object
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from radejax.data.dataset import LabeledFrame
     from radejax.data.records import PreprocessReport
 
@@ -286,17 +282,17 @@ def points(
 
     from radejax.core.manifest import Manifest
     from radejax.data.kradar.folders import is_elevation_axis_up, read_grid
-    from radejax.data.kradar.points import frame_points, read_points, write_points
+    from radejax.data.kradar.points import read_points, write_points
     from radejax.data.kradar.radar_files import find_frames, sequence_folder
     from radejax.data.records import PreprocessReport
 
     sources: dict[pathlib.Path, pathlib.Path | LabeledFrame] = {}
-    read: Callable[[Any], np.ndarray]
     if config is not None:
         frames = entry.read_frames(paths, config, sequences=sequences, weather=weather)
         names = (f"{frame.sequence}/rpc_{frame.name}.{suffix}" for frame in frames)
         sources |= zip(map(out.joinpath, names), frames, strict=True)
-        read = functools.partial(frame_points, grid=frames.grid, **options)
+        grid = frames.grid
+        is_up = True
     else:
         files = find_frames(paths, sequences, weather)
         for path in files:
@@ -312,13 +308,12 @@ def points(
         roots = sorted({*map(pathlib.Path, paths), *folders})
         is_up = is_elevation_axis_up(roots)
         grid = read_grid(roots)
-        read = functools.partial(read_points, grid=grid, is_axis_up=is_up, **options)
     skipped = dict[str, str]()
     Manifest.claim(out, "points", options, patterns=["rpc_*"])
     began = time.perf_counter()
     for target, source in tqdm.tqdm(sources.items(), "points", unit="frame"):
         try:
-            cloud = read(source)
+            cloud = read_points(source, grid, is_axis_up=is_up, **options)
         except (DataError, OSError) as error:
             skipped[getattr(source, "key", str(source))] = str(error)
             continue

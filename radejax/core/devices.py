@@ -180,8 +180,7 @@ def list_of_main(values: list[int]) -> list[int]:
     """
     count = int(multihost_utils.broadcast_one_to_all(np.int32(len(values))))
     own = values if is_main() else [0] * count
-    values = multihost_utils.broadcast_one_to_all(np.asarray(own, np.int32)).tolist()
-    return values
+    return multihost_utils.broadcast_one_to_all(np.asarray(own, np.int32)).tolist()
 
 
 @contextlib.contextmanager

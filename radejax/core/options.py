@@ -212,10 +212,7 @@ def _expected(error: ErrorDetails) -> str:
 
 
 def class_thresholds(
-    given: ClassThresholds,
-    classes: Sequence[str],
-    default: ScoreThreshold,
-    name: str = "score_threshold",
+    given: ClassThresholds, classes: Sequence[str], default: ScoreThreshold
 ) -> ScoreThreshold:
     """Returns one score threshold for all classes, or one per class.
 
@@ -225,7 +222,6 @@ def class_thresholds(
             other classes.
         classes: Names of the classes.
         default: Thresholds of the classes that are not named.
-        name: Name of the option in messages.
 
     Raises:
         UserError: A class is unknown, the number of thresholds is not that of the classes,
@@ -252,7 +248,7 @@ def class_thresholds(
     is_fine = array.shape in ((), (len(classes),))
     is_fine = is_fine and bool(((array >= 0) & (array <= 1)).all())
     count = f"{len(classes)} of them, or CLASS=NUMBER of {', '.join(classes)}"
-    require(is_fine, name, given, f"a number from 0 to 1, {count}")
+    require(is_fine, "score_threshold", given, f"a number from 0 to 1, {count}")
     return tuple(array.tolist()) if array.ndim else float(array)
 
 

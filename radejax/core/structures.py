@@ -285,21 +285,6 @@ class Boxes:
         return cls(np.zeros(len(box), np.int64), box, names, score)
 
     @classmethod
-    def from_columns(cls, columns: Mapping[str, Shaped[np.ndarray, "N ..."]]) -> Boxes:
-        """Creates boxes from the columns that `columns` returns.
-
-        Args:
-            columns: "frame", "box", "cls", for predictions "score", and further columns,
-                which become `extras`.
-
-        Raises:
-            DataError: See `Boxes`.
-        """
-        extras = dict(columns)
-        frame, box, names = (extras.pop(name) for name in ("frame", "box", "cls"))
-        return cls(frame, box, names, extras.pop("score", None), extras)
-
-    @classmethod
     def concatenate(cls, parts: Sequence[Boxes]) -> Boxes:
         """Returns the boxes of all parts in their order.
 
@@ -307,10 +292,10 @@ class Boxes:
             parts: One or more tables with the same columns.
         """
         tables = [part.columns() for part in parts]
-        names = tables[0]
-        joined = {n: np.concatenate([table[n] for table in tables]) for n in names}
+        joined = {n: np.concatenate([table[n] for table in tables]) for n in tables[0]}
+        frame, box, names = (joined.pop(name) for name in ("frame", "box", "cls"))
         total = sum(part.num_truncated for part in parts)
-        return dataclasses.replace(cls.from_columns(joined), num_truncated=total)
+        return cls(frame, box, names, joined.pop("score", None), joined, total)
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -321,8 +306,7 @@ class Boxes:
 
         `decode` clips smaller sizes to this value by default.
         """
-        smallest: Float[np.ndarray, " N"] = self.box[:, 3:6].min(axis=1)
-        return smallest <= np.float32(MIN_SIZE_M)
+        return self.box[:, 3:6].min(axis=1) <= np.float32(MIN_SIZE_M)
 
     def take(self, rows: Shaped[np.ndarray, " K"]) -> Boxes:
         """Returns some of the boxes.
@@ -335,9 +319,9 @@ class Boxes:
             >>> boxes.take(boxes.cls == "Sedan").cls.tolist()
             ['Sedan']
         """
-        return self.from_columns(
-            {name: column[rows] for name, column in self.columns().items()}
-        )
+        score = None if self.score is None else self.score[rows]
+        extras = {name: column[rows] for name, column in self.extras.items()}
+        return Boxes(self.frame[rows], self.box[rows], self.cls[rows], score, extras)
 
     def columns(self) -> dict[str, Shaped[np.ndarray, "N ..."]]:
         """Returns the columns "frame", "box", "cls", "score" if there are any, and extras."""

@@ -232,8 +232,7 @@ def camera_inputs(
             )
     views: list[tuple[Camera, tuple[int, int] | None]] = []
     missing: list[str] = []
-    known: dict[tuple[pathlib.Path, tuple[float, ...]], tuple[Camera, tuple[int, int]]]
-    known = {}
+    known: dict[tuple[object, ...], tuple[Camera, tuple[int, int]]] = {}
     for frame, image in zip(frames, sources, strict=True):
         path = frame.camera_calibration_path
         if image is None or path is None:

@@ -127,7 +127,8 @@ class LabeledFrame:
     is_simulated: bool = False
 
     def __post_init__(self) -> None:
-        boxes, classes = np.asarray(self.boxes), np.asarray(self.classes)
+        boxes = np.asarray(self.boxes, np.float64)
+        classes = np.asarray(self.classes)
         if not boxes.size:  # np.array([]) has other shapes and types
             boxes = np.zeros((0, 7))
         elif boxes.ndim == 2 and boxes.shape[1] == 5:
@@ -372,8 +373,8 @@ class LabeledFrames(Sequence[_F]):
         counts = collections.Counter[str]()
         frames: list[LabeledFrame] = []
         for frame in self:
-            boxes = np.asarray(frame.boxes, np.float64)
-            names = np.asarray(frame.classes)
+            boxes = frame.boxes
+            names = frame.classes
             what = f"frame {frame.key}: shape of boxes"
             expected = "(N, 7): x, y, z, l, w, h, yaw; or (N, 5): x, y, l, w, yaw"
             require(boxes.shape[1:] == (7,), what, boxes.shape, expected)
@@ -400,10 +401,7 @@ class LabeledFrames(Sequence[_F]):
                 what = f"frame {frame.key}: number of rows of column {name!r}"
                 is_equal = len(values) == len(boxes)
                 require(is_equal, what, len(values), f"{len(boxes)}, one per box")
-            if not kept.all():
-                frame = dataclasses.replace(frame, boxes=boxes, classes=names)
-                frame = frame.with_objects(kept)
-            frames.append(frame)
+            frames.append(frame if kept.all() else frame.with_objects(kept))
         lacking = "frames with a camera_path and no camera_calibration_path"
         for frame in self:
             is_lacking = frame.camera_path and not frame.camera_calibration_path
@@ -445,10 +443,7 @@ def find_reader(name: str) -> type[LabeledFrames[LabeledFrame]]:
         UserError: There is no such name, or the class cannot be imported.
     """
     place = "radejax.data.kradar:KRadar" if name == "kradar" else name
-    reader: type[LabeledFrames[LabeledFrame]] = find_part(
-        place, "config.data.format", {"kradar": None}, LabeledFrames
-    )
-    return reader
+    return find_part(place, "config.data.format", {"kradar": None}, LabeledFrames)
 
 
 def held_out(

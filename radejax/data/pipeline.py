@@ -205,25 +205,22 @@ class LoaderOptions:
         shuffle: Whether every epoch has a new random order; otherwise the frames are
             drawn in the order of the table.
         num_epochs: Number of epochs, or None to repeat without end.
-        drop_remainder: Whether to leave out the last, smaller batch of an epoch.
         pad_remainder: Whether to fill the last, smaller batch of an epoch with empty
-            frames of index -1 instead, so that all processes have the same number of
-            batches.
+            frames of index -1, instead of leaving it out.
         num_threads: Number of threads that read frames, or None for one per CPU that
             the process may use; 0 reads them in the calling thread.
-        process_index: Index of this process, or None for that of JAX.
-        process_count: Number of processes, or None for that of JAX.
+        process_index: Index of this process, by default that of JAX.
+        process_count: Number of processes, by default that of JAX.
     """
 
     batch_size: int
     seed: int = 0
     shuffle: bool = True
     num_epochs: int | None = None
-    drop_remainder: bool = True
     pad_remainder: bool = False
     num_threads: int | None = None
-    process_index: int | None = None
-    process_count: int | None = None
+    process_index: int = dataclasses.field(default_factory=jax.process_index)
+    process_count: int = dataclasses.field(default_factory=jax.process_count)
 
 
 def make_loader(
@@ -249,7 +246,7 @@ def make_loader(
 
     Raises:
         UserError: There are fewer frames than one batch of all processes, and the
-            remainder is dropped and not padded.
+            remainder is not padded.
     """
     num_threads = options.num_threads
     if num_threads is None:
@@ -289,16 +286,12 @@ def _make_order(
 
     Frame indices of `num_frames` and above are padding.
     """
-    index = options.process_index
     count = options.process_count
-    if index is None or count is None:
-        index = jax.process_index()
-        count = jax.process_count()
     rows = options.batch_size * count
     total = num_frames
     if options.pad_remainder:
         total = -(-num_frames // rows) * rows
-    elif options.drop_remainder:
+    else:
         check_enough(num_frames, options.batch_size, count)
     # grain shuffles epoch e of seed s in the same way as epoch e - 1 of seed s + 1. The
     # seed is therefore hashed, so that runs with consecutive seeds have unrelated orders.
@@ -307,14 +300,10 @@ def _make_order(
     if options.shuffle:
         dataset = dataset.shuffle(seed=int(spread[1]))
     seeded: grain.MapDataset[np.ndarray] = dataset.random_map(_add_seed)
-    batches = seeded.batch(
-        rows, drop_remainder=options.drop_remainder, batch_fn=np.stack
-    )
+    batches = seeded.batch(rows, drop_remainder=True, batch_fn=np.stack)
     # Every process takes its own rows of each global batch, so that the frames of a
     # training step and their order do not depend on the number of processes.
-    if count == 1:
-        return batches
-    return batches.map(lambda rows: np.array_split(rows, count)[index])
+    return batches.map(lambda rows: np.array_split(rows, count)[options.process_index])
 
 
 def _add_seed(frame: int, rng: np.random.Generator) -> Int[np.ndarray, "2"]:
@@ -369,18 +358,14 @@ class _LoadBatch(grain.transforms.Map):
     def _sample(self, index: int) -> Sample:
         """Returns the sample of one frame."""
         table = self._table
-        images = self._table.images
-        projection = read_sample(table.records, table.keys[index])
-        sample = Sample(
-            projection,
-            table.boxes[index],
-            table.classes[index],
+        images = table.images
+        return Sample(
+            projection=read_sample(table.records, table.keys[index]),
+            boxes=table.boxes[index],
+            classes=table.classes[index],
+            image=None if images is None else images.image(index),
+            camera=None if images is None else images.cameras[index],
             targets={name: values[index] for name, values in table.targets.items()},
-        )
-        if images is None:
-            return sample
-        return dataclasses.replace(
-            sample, image=images.image(index), camera=images.cameras[index]
         )
 
     def _empty(self, size: int) -> Batch:

@@ -121,8 +121,7 @@ def _power_db(
     )
     require(is_same, "shape of the projection", projection.shape, expected)
     channels = slice(grid.num_doppler or None)
-    power_db: np.ndarray = projection[..., channels].max(-1) * LOG_SCALE_DB
-    return power_db - LOG_OFFSET_DB
+    return projection[..., channels].max(-1) * LOG_SCALE_DB - LOG_OFFSET_DB
 
 
 def _points_where(
@@ -171,5 +170,4 @@ def local_mean_db(
     whole = uniform_filter(power, outer, mode="nearest") * outer**2
     guard = uniform_filter(power, inner, mode="nearest") * inner**2
     mean = (whole - guard) / (outer**2 - inner**2)
-    mean_db: np.ndarray = 10.0 * np.log10(np.maximum(mean, 1e-10))
-    return mean_db
+    return 10.0 * np.log10(np.maximum(mean, 1e-10))

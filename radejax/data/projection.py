@@ -161,8 +161,7 @@ def to_log_scale(
     """Converts linear power to the normalized decibels of the network input."""
     level: np.ndarray = np.log10(power + power.dtype.type(POWER_FLOOR))
     level *= 10.0 / LOG_SCALE_DB
-    scaled: np.ndarray = np.add(level, LOG_OFFSET_DB / LOG_SCALE_DB, out=out)
-    return scaled
+    return np.add(level, LOG_OFFSET_DB / LOG_SCALE_DB, out=out)
 
 
 def linear_power(
@@ -352,8 +351,7 @@ def unstack_frames(
         part.reshape(*part.shape[:-1], num_frames, part.shape[-1] // num_frames)
         for part in xp.split(stacked, [num_frames * num_doppler], axis=-1)
     ]
-    frames: ArrayT = xp.moveaxis(xp.concatenate(parts, -1), -2, -4)
-    return frames
+    return xp.moveaxis(xp.concatenate(parts, -1), -2, -4)
 
 
 ENCODINGS = ("float16", "uint8", "float32")
@@ -372,8 +370,7 @@ def encode(
         encoding: One of `ENCODINGS`.
     """
     if encoding == "uint8":
-        levels: np.ndarray = np.clip(projection, 0.0, 1.0) * 255.0
-        return levels.round().astype(np.uint8)
+        return (np.clip(projection, 0.0, 1.0) * 255.0).round().astype(np.uint8)
     return projection.astype(encoding)
 
 

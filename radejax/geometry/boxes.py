@@ -83,8 +83,7 @@ def boxes8_from_7(boxes: Real[ArrayT, "*batch 7"]) -> Float[ArrayT, "*batch 8"]:
     xp = array_module(boxes)
     boxes = _checked(xp.asarray(boxes), 7)
     yaw = boxes[..., 6:7]
-    converted: ArrayT = xp.concatenate([boxes[..., :6], xp.sin(yaw), xp.cos(yaw)], -1)
-    return converted
+    return xp.concatenate([boxes[..., :6], xp.sin(yaw), xp.cos(yaw)], -1)
 
 
 def boxes7_from_8(boxes: Real[ArrayT, "*batch 8"]) -> Float[ArrayT, "*batch 7"]:
@@ -108,8 +107,7 @@ def boxes7_from_8(boxes: Real[ArrayT, "*batch 8"]) -> Float[ArrayT, "*batch 7"]:
     xp = array_module(boxes)
     boxes = _checked(xp.asarray(boxes), 8)
     yaw = xp.arctan2(boxes[..., 6:7], boxes[..., 7:8])
-    converted: ArrayT = xp.concatenate([boxes[..., :6], yaw], -1)
-    return converted
+    return xp.concatenate([boxes[..., :6], yaw], -1)
 
 
 def bev_corners(boxes: Real[ArrayT, "*batch _"]) -> Float[ArrayT, "*batch 4 2"]:
@@ -143,8 +141,7 @@ def bev_corners(boxes: Real[ArrayT, "*batch _"]) -> Float[ArrayT, "*batch 4 2"]:
     left = boxes[..., 4, None] / 2 * across
     x = boxes[..., 0, None] + cos * ahead - sin * left
     y = boxes[..., 1, None] + sin * ahead + cos * left
-    ends: ArrayT = xp.stack([x, y], -1)
-    return ends
+    return xp.stack([x, y], -1)
 
 
 def corners(boxes: Real[ArrayT, "*batch _"]) -> Float[ArrayT, "*batch 8 3"]:
@@ -169,8 +166,7 @@ def corners(boxes: Real[ArrayT, "*batch _"]) -> Float[ArrayT, "*batch 8 3"]:
     half = boxes[..., 5, None, None] / 2
     bottom = xp.concatenate([ground, center - half], -1)
     top = xp.concatenate([ground, center + half], -1)
-    ends: ArrayT = xp.concatenate([bottom, top], -2)
-    return ends
+    return xp.concatenate([bottom, top], -2)
 
 
 def _checked(boxes: ArrayT, width: int) -> ArrayT:

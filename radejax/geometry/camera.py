@@ -141,8 +141,7 @@ def stack_cameras(cameras: Sequence[Camera]) -> Camera:
         stacked = np.stack(leaves)
         return stacked if stacked.dtype == bool else stacked.astype(np.float32)
 
-    batch: Camera = jax.tree.map(stack, *cameras)
-    return batch
+    return jax.tree.map(stack, *cameras)
 
 
 def to_camera(
@@ -169,8 +168,7 @@ def to_camera(
     transform = xp.expand_dims(camera.cam_from_ego, axes)
     # Accelerators may compute a matrix product in reduced precision, unlike this sum.
     turned = xp.sum(transform[..., :3] * points[..., None, :], -1)
-    moved: ArrayT = turned + transform[..., 3]
-    return moved
+    return turned + transform[..., 3]
 
 
 def to_pixels(
@@ -208,8 +206,7 @@ def to_pixels(
     folds = square > xp.expand_dims(camera.max_radius, axes) ** 2
     x_seen = xp.where(folds, x * 1e3, x_seen)
     y_seen = xp.where(folds, y * 1e3, y_seen)
-    pixels: ArrayT = xp.stack([fx * x_seen + cx, fy * y_seen + cy], -1)
-    return pixels
+    return xp.stack([fx * x_seen + cx, fy * y_seen + cy], -1)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -303,10 +300,7 @@ class CameraCalibration(ArrayValues):
             DataError: A line is not `key: number`, a key is missing or a value is out of
                 range. The message names the file.
         """
-        path = as_path(path)
-        if not path.is_file():
-            raise FileNotFoundError(f"camera calibration {path} does not exist")
-        values = _read_numbers(path)
+        values = _read_numbers(as_path(path))
         if missing := [key for key in _KEYS if key not in values]:
             raise DataError(f"{path}: camera calibration lacks {', '.join(missing)}")
         yaw, pitch, roll = (values[key] for key in _ANGLES)

@@ -85,8 +85,7 @@ def values_at(axis: Float[np.ndarray, " bins"], position: PositionT) -> Position
         [0.0, 3.0, 6.0]
     """
     if is_uniform(axis):
-        values: PositionT = axis[0] + position * _step(axis)
-        return values
+        return axis[0] + position * _step(axis)
     return _interpolated(position, np.arange(axis.size), axis)
 
 
@@ -104,8 +103,7 @@ def _interpolated(x: PositionT, xs: np.ndarray, ys: np.ndarray) -> PositionT:
     left = xp.clip(left, 0, xs.size - 2)
     tables = xs, ys, np.diff(ys) / np.diff(xs)
     start, value, slope = (xp.asarray(table)[left] for table in tables)
-    interpolated: PositionT = value + (x - start) * slope
-    return interpolated
+    return value + (x - start) * slope
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -149,11 +147,9 @@ class RadarGrid(ArrayValues):
     def __post_init__(self) -> None:
         for name, least in _LEAST_BINS.items():
             axis = self.freeze(name)
-            if axis.ndim != 1 or axis.size < least:
-                raise UserError(
-                    f"{name} must be a vector of at least {least} bins, got shape "
-                    f"{axis.shape}"
-                )
+            is_vector = axis.ndim == 1 and axis.size >= least
+            expected = f"one axis of at least {least} bins"
+            require(is_vector, f"shape of {name}", axis.shape, expected)
             is_angle = name.endswith("_rad")
             limit = np.pi if is_angle else _MAX_VALUE
             if not (np.abs(axis) <= limit).all():
@@ -179,9 +175,8 @@ class RadarGrid(ArrayValues):
             value = getattr(self, name)
             limit = np.pi if name.endswith("_rad") else _MAX_VALUE
             limit = min(limit, 2 * np.abs(getattr(self, name[len("fov_") :])).max())
-            if not 0 < value <= limit:
-                message = f"positive, to {limit:g} for its axis, got {value}"
-                raise UserError(f"{name} must be {message}")
+            expected = f"a number above 0, to {limit:g} for its axis"
+            require(0 < value <= limit, name, float(value), expected)
 
     # Construction --------------------------------------------------------------------
 
@@ -383,8 +378,7 @@ class RadarGrid(ArrayValues):
         range_m = values_at(self.range_m, range_bin)
         azimuth = values_at(self.azimuth_rad, azimuth_bin)
         y_m = -range_m * xp.sin(azimuth)
-        positions: ArrayT = xp.stack([range_m * xp.cos(azimuth), y_m], -1)
-        return positions
+        return xp.stack([range_m * xp.cos(azimuth), y_m], -1)
 
     def ego_to_bin(
         self, x_m: Number | Real[ArrayT, "*#bins"], y_m: Number | Real[ArrayT, "*#bins"]
@@ -417,8 +411,7 @@ class RadarGrid(ArrayValues):
         azimuth_bin = (azimuth - middle) * last / span + last / 2
         if not is_uniform(axis):
             azimuth_bin = _interpolated(azimuth, axis, np.arange(axis.size))
-        bins: ArrayT = xp.stack([range_bin, azimuth_bin], -1)
-        return bins
+        return xp.stack([range_bin, azimuth_bin], -1)
 
     def nearest_bin(
         self, x_m: Number | Real[ArrayT, "*#bins"], y_m: Number | Real[ArrayT, "*#bins"]
@@ -438,8 +431,7 @@ class RadarGrid(ArrayValues):
         xp = array_module(bins)
         last = xp.asarray([self.num_range - 1, self.num_azimuth - 1], bins.dtype)
         last = xp.broadcast_to(last, bins.shape)
-        nearest: ArrayT = xp.clip(xp.round(bins), 0, last).astype(xp.int32)
-        return nearest
+        return xp.clip(xp.round(bins), 0, last).astype(xp.int32)
 
     def bin_centers_ego(self) -> Float[np.ndarray, "R A 2"]:
         """Returns x and y of every range-azimuth bin center in meters, `[R, A, 2]` float64."""
@@ -512,5 +504,4 @@ class RadarGrid(ArrayValues):
         xp, (x_m, y_m) = as_floats(x_m, y_m)
         is_ahead = xp.abs(xp.arctan2(y_m, x_m)) <= self.fov_azimuth_rad
         is_near = xp.sqrt(x_m * x_m + y_m * y_m) <= self.fov_range_m
-        is_inside: ArrayT = is_ahead & is_near
-        return is_inside
+        return is_ahead & is_near

@@ -89,14 +89,13 @@ def iou_3d(
     ground_a = _footprint(xp, a)
     ground_b = _footprint(xp, b)
     area = _intersection(xp, ground_a, ground_b)
-    height_a: ArrayT = xp.maximum(a[..., 5], 0)
-    height_b: ArrayT = xp.maximum(b[..., 5], 0)
+    height_a = xp.maximum(a[..., 5], 0)
+    height_b = xp.maximum(b[..., 5], 0)
     # The difference of top and bottom may round to more than either height.
     shared = xp.minimum(shared_height(a, b, z_center), xp.minimum(height_a, height_b))
-    volume: ArrayT = area * shared
     volume_a = ground_a[2] * ground_a[3] * height_a
     volume_b = ground_b[2] * ground_b[3] * height_b
-    return _ratio(xp, volume, volume_a, volume_b)
+    return _ratio(xp, area * shared, volume_a, volume_b)
 
 
 def bev_intersection(
@@ -133,8 +132,7 @@ def shared_height(
     above, below = 1 - z_center, z_center
     top = xp.minimum(a[..., 2] + above * a[..., 5], b[..., 2] + above * b[..., 5])
     bottom = xp.maximum(a[..., 2] - below * a[..., 5], b[..., 2] - below * b[..., 5])
-    height: ArrayT = xp.maximum(top - bottom, 0)
-    return height
+    return xp.maximum(top - bottom, 0)
 
 
 def _all_pairs(a: ArrayT, b: ArrayT) -> tuple[types.ModuleType, ArrayT, ArrayT]:
@@ -216,8 +214,7 @@ def _intersection(
         inside = xp.maximum(b_high[j] - b_low[j], 0)
         twice_area = twice_area + inside * (b_half[j][0] + x * vy - y * vx)
     smaller = xp.minimum(a_length * a_width, b_length * b_width)
-    area: ArrayT = xp.clip(twice_area / 2, 0, smaller)
-    return area
+    return xp.clip(twice_area / 2, 0, smaller)
 
 
 def _ratio(
@@ -225,5 +222,4 @@ def _ratio(
 ) -> ArrayT:
     """Computes intersection over union, 0 where both boxes are empty."""
     union = size_a + size_b - shared
-    ratio: ArrayT = shared / xp.where(union > 0, union, 1)
-    return ratio
+    return shared / xp.where(union > 0, union, 1)

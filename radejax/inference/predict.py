@@ -107,8 +107,7 @@ def predict_dataset(
         batch_size=rows,
         shuffle=False,
         num_epochs=1,
-        drop_remainder=False,
-        pad_remainder=len(devices) > 1,  # for one device, the detector pads the batch
+        pad_remainder=True,
         process_index=jax.process_index() % num_processes,
         process_count=num_processes,
     )

@@ -183,8 +183,9 @@ def test_samples_are_the_records_of_a_frame_and_the_preceding_ones(
     with caplog.at_level("INFO", "radejax"):
         table = make_table(records, test, max_objects=5, num_frames=2)
     augment = Augmentation(records.grid, probability)
-    options = dataclasses.replace(OPTIONS, batch_size=4, num_epochs=1, shuffle=False)
-    options = dataclasses.replace(options, drop_remainder=False, pad_remainder=True)
+    options = dataclasses.replace(
+        OPTIONS, batch_size=4, num_epochs=1, shuffle=False, pad_remainder=True
+    )
     keys, doppler = [frame.key for frame in every], records.grid.num_doppler
     seen, repeated = 0, 0
     for batch in make_loader(table, options, augment=augment):

@@ -75,6 +75,11 @@ def _read_tensor(folder: Folder) -> None:
     assert np.isfinite(project_file(folder / "a.mat", shape_drea=GRID.shape_drea)).all()
 
 
+def _read_projection(folder: Folder) -> None:
+    shape = GRID.num_range, GRID.num_azimuth, GRID.num_elevation
+    assert read_projection_npy(folder / "a.npy", shape).shape == shape
+
+
 def _weights(folder: Folder, suffix: str) -> None:
     detector = small.detector()
     state = radenet_torch.save(detector.model, detector.variables)
@@ -118,7 +123,7 @@ READERS |= {
     "dataset": Reader(_root, _read_root, "**/*.txt", 50),
     "projection npy": Reader(
         functools.partial(_tensor, kind="plain"),
-        lambda folder: read_projection_npy(folder / "a.npy"),
+        _read_projection,
         "a.npy",
     ),
 }

@@ -125,8 +125,11 @@ def test_values_survive_json_and_compare_and_hash():
             lambda: changed(azimuth_rad=np.linspace(-53, 53, 107)),
             "azimuth_rad must be finite, to 3.* radians .* -53 to 53$",
         ),
-        (lambda: changed(fov_range_m=np.nan), "positive, to 236.074 .*, got nan"),
-        (lambda: changed(fov_azimuth_rad=53.0), "fov_azimuth.* positive, to 1.85005"),
+        (lambda: changed(fov_range_m=np.nan), "is nan, expected .* above 0, to 236.07"),
+        (
+            lambda: changed(fov_azimuth_rad=53.0),
+            "fov_azimuth_rad is 53.0, .* to 1.85005",
+        ),
         (lambda: changed(doppler_mps=[], elevation_rad=[]), "are both empty"),
     ],
 )

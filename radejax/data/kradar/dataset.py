@@ -18,7 +18,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Float
 
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import PathLike, as_path
@@ -27,7 +27,6 @@ from radejax.data.dataset import LabeledFrame, LabeledFrames, Summary
 from radejax.data.kradar import conditions, folders, motion
 from radejax.data.kradar.labels import (
     LABEL_CLASSES,
-    VERSIONS,
     VISIBILITY_FLAGS,
     Key,
     Label,
@@ -82,11 +81,6 @@ class Frame(LabeledFrame):
     projection_path: pathlib.Path | None
     ego_speed_mps: float | None = None
 
-    @property
-    def visibility(self) -> Shaped[np.ndarray, " N"]:
-        """Visibility flags of `boxes`."""
-        return self.columns["visibility"]
-
     def read_projection(self, grid: RadarGrid) -> np.ndarray:
         """Reads the float32 projection, see `tesseract.read_frame`."""
         if self.radar_path is None:
@@ -139,16 +133,12 @@ class ReadOptions:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "version", normalize_version(self.version))
-        for name in ("visibility", "classes", "sequences", "weather"):
-            values = getattr(self, name)
-            if not isinstance(values, str | None):  # iterators can be read only once
-                object.__setattr__(self, name, tuple(values))
         if self.visibility is not None:
             _require_known("visibility", self.visibility, VISIBILITY_FLAGS)
         if self.weather is not None:
             conditions.check_weather(self.weather)
         _require_known("classes", self.classes, LABEL_CLASSES)
-        require(bool(self.classes), "classes", (), "at least one")
+        require(len(self.classes) > 0, "classes", (), "at least one")
 
 
 def _require_known(name: str, values: Collection[str], known: Sequence[str]) -> None:
@@ -529,8 +519,8 @@ def select(
     boxes = np.concatenate([np.zeros((0, 7)), *(frame.boxes for frame in frames)])
     text = np.zeros(0, np.str_)
     classes = np.concatenate([text, *(frame.classes for frame in frames)])
-    flags = np.concatenate([text, *(frame.visibility for frame in frames)])
-    is_known = np.isin(flags, VISIBILITY_FLAGS)
+    flags = np.concatenate([text, *(frame.columns["visibility"] for frame in frames)])
+    is_odd = ~np.isin(flags, VISIBILITY_FLAGS)
     is_kept = np.ones(len(boxes), bool)
     rules = {"class": np.isin(classes, list(options.classes))}
     rules["visibility"] = rules["field of view"] = is_kept
@@ -538,9 +528,8 @@ def select(
         rules["visibility"] = np.isin(flags, list(options.visibility))
     if options.field_of_view:
         rules["field of view"] = grid.in_field_of_view(*boxes[:, :2].T)
-    counts = collections.Counter(
-        {"objects with an odd availability flag": int((~is_known).sum())}
-    )
+    counts = collections.Counter[str]()
+    counts["objects with an odd availability flag"] = int(is_odd.sum())
     for rule, passes in rules.items():
         counts[f"objects left out by {rule}"] = int((is_kept & ~passes).sum())
         is_kept = is_kept & passes
@@ -648,10 +637,7 @@ class KRadar(LabeledFrames[Frame]):
             options: The section `config.data`.
             classes: Classes to detect.
         """
-        version = options.label_version
-        is_version = f"v{version.removeprefix('v')}" in VERSIONS
-        expected = f"one of {', '.join(VERSIONS)}"
-        require(is_version, "config.data.label_version", version, expected)
+        normalize_version(options.label_version)
         _require_known("config.data.weather", options.weather, conditions.WEATHERS)
         visibility = options.visibility or ()
         _require_known("config.data.visibility", visibility, VISIBILITY_FLAGS)

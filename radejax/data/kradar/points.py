@@ -12,7 +12,7 @@ from radejax.core.errors import DataError, require
 from radejax.core.files import PathLike, as_path, atomic_write
 from radejax.data.dataset import LabeledFrame
 from radejax.data.kradar import reduced, tesseract
-from radejax.data.points import Points, cfar_points, percentile_points
+from radejax.data.points import cfar_points, percentile_points
 from radejax.geometry.radar_grid import RadarGrid
 
 _MAX_HEADER_LINES = 20
@@ -25,7 +25,7 @@ POINT_FIELDS = (
 
 
 def read_points(
-    path: PathLike,
+    source: PathLike | LabeledFrame,
     grid: RadarGrid,
     method: str = "percentile",
     *,
@@ -33,13 +33,15 @@ def read_points(
     threshold_db: float = 9.0,
     is_axis_up: bool = False,
 ) -> Float[np.ndarray, "N 11"]:
-    """Returns the points of a radar file, with the columns `POINT_FIELDS`.
+    """Returns the points of a radar file or a frame, with the columns `POINT_FIELDS`.
 
     Args:
-        path: Radar tensor, projection, or frame of a reduced release.
+        source: Radar tensor, projection, or frame of a reduced release; or a frame of any
+            reader.
         grid: Axes of the radar.
         method: "percentile" for the cells with the largest mean power, as in K-Radar's
-            releases, or "cfar" for `cfar_points`.
+            releases, or of a reader's frame for the strongest bins of the range-azimuth
+            map; or "cfar" for `cfar_points`.
         rate: Fraction of the cells that become points ("percentile").
         threshold_db: Minimum power above the mean of the training cells ("cfar").
         is_axis_up: Whether the elevation axis points up, see `is_elevation_axis_up`.
@@ -51,51 +53,23 @@ def read_points(
             projection and the method "percentile".
     """
     require(method in ("percentile", "cfar"), "method", method, "percentile or cfar")
-    if method == "percentile":
+    if isinstance(source, LabeledFrame):
+        projection = source.read_projection(grid)
+    elif method == "cfar":
+        projection = tesseract.read_frame(source, grid)
+    else:
         require(0 < rate < 1, "rate", rate, "a number above 0 and below 1")
-        polar = tesseract.read_polar(path, grid)
+        polar = tesseract.read_polar(source, grid)
         return reduced.strongest_points(polar, grid, rate, is_axis_up=is_axis_up)
-    found = cfar_points(
-        tesseract.read_frame(path, grid), grid, threshold_db=threshold_db
-    )
-    return to_columns(found, grid, is_axis_up=is_axis_up)
-
-
-def to_columns(
-    found: Points, grid: RadarGrid, *, is_axis_up: bool = True
-) -> Float[np.ndarray, "N 11"]:
-    """Returns points of `radejax.data.points` with the columns `POINT_FIELDS`.
-
-    Args:
-        found: The points.
-        grid: Axes of the radar.
-        is_axis_up: Whether the elevation axis points up, see `is_elevation_axis_up`.
-    """
+    if method == "cfar":
+        found = cfar_points(projection, grid, threshold_db=threshold_db)
+    else:
+        found = percentile_points(projection, grid, rate)
     power = 10 ** (found.power_db / 10) / reduced.POWER_UNIT
     bins = found.range_bin, found.azimuth_bin, found.elevation_bin
     return reduced.points_of_bins(
         bins, power, found.doppler_mps, grid, is_axis_up=is_axis_up
     )
-
-
-def frame_points(
-    frame: LabeledFrame,
-    grid: RadarGrid,
-    method: str = "percentile",
-    *,
-    rate: float = 0.01,
-    threshold_db: float = 9.0,
-) -> Float[np.ndarray, "N 11"]:
-    """Returns the points of a frame of any reader as `read_points` does.
-
-    "percentile" chooses the strongest bins of the range-azimuth map.
-    """
-    projection = frame.read_projection(grid)
-    if method == "cfar":
-        found = cfar_points(projection, grid, threshold_db=threshold_db)
-    else:
-        found = percentile_points(projection, grid, rate)
-    return to_columns(found, grid)
 
 
 def write_points(path: PathLike, points: Float[np.ndarray, "N 11"]) -> None:

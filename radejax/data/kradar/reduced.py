@@ -187,12 +187,7 @@ def reduce_tensor(tesseract: Real[np.ndarray, "D R E A"], grid: RadarGrid) -> Po
 
 
 def strongest_points(
-    polar: Polar,
-    grid: RadarGrid,
-    rate: float,
-    range_wise: bool = False,
-    *,
-    is_axis_up: bool = False,
+    polar: Polar, grid: RadarGrid, rate: float, *, is_axis_up: bool = False
 ) -> Float[np.ndarray, "N 11"]:
     """Returns the points of an `rpc` file from a `polar3d` array.
 
@@ -200,13 +195,10 @@ def strongest_points(
         polar: Mean power and mean Doppler.
         grid: Axes of the radar.
         rate: Fraction of the cells that become points, above 0 and below 1.
-        range_wise: Whether to take this fraction of the cells at every range, instead of
-            all cells.
         is_axis_up: See `points_of_bins`.
     """
     power, doppler = polar
-    axes = (1, 2) if range_wise else None
-    bins = np.nonzero(power > np.quantile(power, 1 - rate, axis=axes, keepdims=True))
+    bins = np.nonzero(power > np.quantile(power, 1 - rate))
     return points_of_bins(bins, power[bins], doppler[bins], grid, is_axis_up=is_axis_up)
 
 

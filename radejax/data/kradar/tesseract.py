@@ -112,14 +112,13 @@ def _check_power(
 
 
 def read_projection_npy(
-    path: PathLike, *, projection_shape: tuple[int, ...] | None = None
+    path: PathLike, projection_shape: tuple[int, int, int]
 ) -> Float[np.ndarray, "R A DE"]:
     """Reads a projection in the order of the authors' code, or with its channels last.
 
     Args:
-        path: `DERA_tesseract_*.npy`, `[D+E, R, A]` floats. `[R, A, D+E]` is read too if
-            `projection_shape` tells that it is meant.
-        projection_shape: Expected shape `(R, A, D+E)`, or None to accept any.
+        path: `DERA_tesseract_*.npy`, `[D+E, R, A]` or `[R, A, D+E]` floats.
+        projection_shape: Expected shape `(R, A, D+E)`.
 
     Returns:
         The array in the stored type.
@@ -143,22 +142,20 @@ def read_projection_npy(
 
 
 def _projection_axes(
-    path: PathLike, stored: np.ndarray, projection_shape: tuple[int, ...] | None
+    path: PathLike, stored: np.ndarray, projection_shape: tuple[int, int, int]
 ) -> tuple[int, int, int]:
     """Returns the positions of range, azimuth and channels in a stored projection."""
-    if stored.ndim == 3 and stored.dtype.kind == "f":
-        if projection_shape in (None, stored.transpose(1, 2, 0).shape):
-            return 1, 2, 0
-        if projection_shape == stored.shape:
-            return 0, 1, 2
-    expected = "[Doppler + elevation, range, azimuth]"
-    if projection_shape is not None:
-        r, a, c = projection_shape
-        expected += f" = {(c, r, a)}, or {projection_shape} with the channels last"
+    r, a, c = projection_shape
+    is_float = stored.dtype.kind == "f"
+    if is_float and stored.shape == (c, r, a):
+        return 1, 2, 0
+    if is_float and stored.shape == (r, a, c):
+        return 0, 1, 2
     hint = "; it seems to be a radar tensor" if stored.ndim == 4 else ""
     raise DataError(
-        f"{path}: shape {stored.shape} of {stored.dtype}, expected floats "
-        f"{expected}{hint}"
+        f"{path}: shape {stored.shape} of {stored.dtype}, expected floats [Doppler + "
+        f"elevation, range, azimuth] = {(c, r, a)}, or {projection_shape} with the "
+        f"channels last{hint}"
     )
 
 
@@ -174,11 +171,10 @@ def read_frame(path: PathLike, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
     """
     if pathlib.Path(path).suffix != ".npy":
         whole = project_file(path, shape_drea=grid.shape_drea)
-        projection: np.ndarray = grid.measured_channels(whole)
-        return projection
+        return grid.measured_channels(whole)
     if reduced.is_reduced_file(path):
         return reduced.project_reduced(read_npy(path, mapped=True), grid, str(path))
-    projection = read_projection_npy(path, projection_shape=grid.projection_shape)
+    projection = read_projection_npy(path, grid.projection_shape)
     return projection.astype(np.float32)
 
 

@@ -69,7 +69,7 @@ def test_filters_can_be_changed(tmp_path):
         tmp_path, visibility=None, classes=LABEL_CLASSES, field_of_view=False
     )
     assert len(everything[0].boxes) == 2
-    assert everything[0].visibility.tolist() == ["L1", "R"]
+    assert everything[0].columns["visibility"].tolist() == ["L1", "R"]
     write.write_calibration(tmp_path / "1/info_calib/calib_radar_lidar.txt", 3, 5.0, -1)
     shifted = KRadar(tmp_path, visibility=("L1",))
     np.testing.assert_allclose(shifted[0].boxes[:, :3], [[7.0, 0.0, 0.5]])
@@ -166,7 +166,7 @@ def test_parsed_objects_equal_the_reference(shared, tmp_path):
             version=case["version"],
             visibility=("R",) if case["radar_only"] else ("R", "L"),
         )
-        boxes, classes, flags = frame.boxes, frame.classes, frame.visibility
+        boxes, classes, flags = frame.boxes, frame.classes, frame.columns["visibility"]
         if case["narrow_roi_filter"]:
             x, y, z = boxes[:, :3].T
             rows = (x >= 0) & (x <= 72) & (abs(y) <= 6.4) & (z >= -2) & (z <= 6)

@@ -98,7 +98,7 @@ def test_columns_are_those_of_the_kept_boxes(tmp_path):
     frame = KRadar(tmp_path)[0]
     assert frame.columns["track_id"].tolist() == [4, 6]
     np.testing.assert_allclose(frame.columns["velocity_mps"], [[40, 0], [60, 0]])
-    assert frame.visibility.tolist() == ["R", "R"]
+    assert frame.columns["visibility"].tolist() == ["R", "R"]
 
 
 def test_columns_of_own_readers_are_kept_with_their_boxes():
