@@ -34,11 +34,12 @@ Roi = str | Sequence[float] | None
 """A region of interest: "narrow", "wide", (x0, x1, y0, y1, z0, z1), or None for all."""
 
 
-def roi_bounds(roi: Roi) -> tuple[float, ...] | None:
+def roi_bounds(roi: Roi, field: str = "roi") -> tuple[float, ...] | None:
     """Returns the bounds (x0, x1, y0, y1, z0, z1) of a named or given region of interest.
 
     Args:
         roi: One of `ROIS`, the bounds in meters in the radar frame, or None.
+        field: Name of the option for the error message.
 
     Raises:
         UserError: The name is unknown, or the bounds are not three increasing pairs.
@@ -50,11 +51,11 @@ def roi_bounds(roi: Roi) -> tuple[float, ...] | None:
     if roi is None:
         return None
     if isinstance(roi, str):
-        require(roi in ROIS, "roi", roi, f"one of {', '.join(ROIS)}")
+        require(roi in ROIS, field, roi, f"one of {', '.join(ROIS)}")
         return ROIS[roi]
     bounds = np.asarray(roi, np.float64).reshape(-1)
     is_valid = bounds.size == 6 and bool((bounds[::2] < bounds[1::2]).all())
-    require(is_valid, "roi", roi, "x0, x1, y0, y1, z0, z1 with increasing bounds")
+    require(is_valid, field, roi, "x0, x1, y0, y1, z0, z1 with increasing bounds")
     return tuple(bounds.tolist())
 
 
