@@ -199,8 +199,8 @@ class EvaluationSet:
         self.score = self.pred.score
         self.gt_group = self.gt.frame * len(self.classes) + self.gt.cls
         self.pred_group = self.pred.frame * len(self.classes) + self.pred.cls
-        self.gt_count = self._count(self.gt_group)
-        pairs = self.gt_count * self._count(self.pred_group)
+        self.gt_count = self.count_groups(self.gt_group)
+        pairs = self.gt_count * self.count_groups(self.pred_group)
         if pairs.max(initial=0) > MAX_PAIRS:
             frame, cls = np.unravel_index(pairs.argmax(), pairs.shape)
             raise DataError(
@@ -232,8 +232,8 @@ class EvaluationSet:
         extras = {name: x[row] for name, x in table.extras.items()}
         return Boxes(position[row], table.box[row], cls[row], score, extras), row
 
-    def _count(self, group: Int[np.ndarray, " N"]) -> Int[np.ndarray, "F C"]:
-        """Returns the number of boxes of every class in every frame."""
+    def count_groups(self, group: Int[np.ndarray, " N"]) -> Int[np.ndarray, "F C"]:
+        """Counts boxes by frame and class from rows of `gt_group` or `pred_group`."""
         shape = self.frame.size, len(self.classes)
         return np.bincount(group, minlength=shape[0] * shape[1]).reshape(shape)
 
