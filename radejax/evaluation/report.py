@@ -280,12 +280,8 @@ def _console_text(metrics: JsonObject, tables: RunTables) -> str:
 
 def describe(metrics: JsonObject) -> str:
     """Describes in one line where the numbers of metrics.json come from."""
-    known = {
-        "step": metrics["step"],
-        "data": metrics["data"],
-        "split": metrics["split"],
-    }
-    parts = [f"{name} {value}" for name, value in known.items() if value is not None]
+    known = [name for name in ("step", "data", "split") if metrics[name] is not None]
+    parts = [f"{name} {metrics[name]}" for name in known]
     parts += [f"radejax {metrics['radejax']}", f"commit {metrics['commit']}"]
     return ", ".join([*parts, metrics["date"]])
 
