@@ -228,9 +228,8 @@ class EvaluationSet:
         self.left_out[f"{name}: center outside the region of interest"] = num_outside
         row = np.flatnonzero(is_class & is_inside)
         row = row[np.lexsort((row, cls[row], position[row]))]
-        score = None if table.score is None else table.score[row]
-        extras = {name: x[row] for name, x in table.extras.items()}
-        return Boxes(position[row], table.box[row], cls[row], score, extras), row
+        found = table.take(row)
+        return dataclasses.replace(found, frame=position[row], cls=cls[row]), row
 
     def count_groups(self, group: Int[np.ndarray, " N"]) -> Int[np.ndarray, "F C"]:
         """Counts boxes by frame and class from rows of `gt_group` or `pred_group`."""
