@@ -33,13 +33,7 @@ from radejax.evaluation import protocols, report
 from radejax.evaluation.analysis import distance_sets
 from radejax.evaluation.boxes import Columns, frame_keys, take
 from radejax.evaluation.evaluation_set import SPACES, EvaluationSet
-from radejax.evaluation.files import (
-    Source,
-    known_classes,
-    load,
-    report_folders,
-    stored_options,
-)
+from radejax.evaluation.files import Source, load, options_for, report_folders
 from radejax.evaluation.results import (
     LEVEL,
     ReportOptions,
@@ -375,14 +369,8 @@ def compare_files(
             "--bootstrap=0: a comparison needs 1 resample or more, or only --figures"
         )
     folders = [report_folders(path) for path in paths]
-    # Predictions below the lowest stored score of one run must not count for another run.
     seeds = [seed for run in folders for seed in run.values()]
-    stored = (stored_options(seed).get("min_score", 0) for seed in seeds)
-    known = known_classes(*seeds, source.ground_truth)
-    options = options.replace(
-        min_score=max(options.min_score, *stored),
-        known_classes=tuple(sorted(known.union(options.known_classes))),
-    )
+    options = options_for(seeds, source, options)
     names = [str(path) for path in paths]
     first, frames = _load_run(folders[0], source, options)
     others = [_load_run(run, source, options, frames)[0] for run in folders[1:]]
