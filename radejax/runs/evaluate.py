@@ -34,12 +34,7 @@ from radejax.evaluation.analysis import (
     mistakes,
     worst_frames,
 )
-from radejax.evaluation.boxes import (
-    class_indices,
-    roi_bounds,
-    roi_name,
-    tables_from_frames,
-)
+from radejax.evaluation.boxes import class_indices, roi_name, tables_from_frames
 from radejax.evaluation.evaluation_set import EvaluationSet, Result
 from radejax.evaluation.html import SceneFigure
 from radejax.evaluation.report import (
@@ -369,7 +364,7 @@ class Evaluation:
             decode(records[frame.key]),
             records.grid,
             predictions=predictions.take(is_drawn),
-            roi=roi_bounds(self._options.roi),
+            roi=self._options.roi,
             iou=self._options.iou_thresholds[0],
             score_threshold=threshold,
             **fields,
