@@ -287,8 +287,7 @@ def pooled_curve(
     made = np.cumsum(weight)
     if curve == "all_point":
         # Equal scores are one threshold, so that their order does not matter.
-        last = np.ones(score.size, bool)
-        last[:-1] = score[1:] != score[:-1]
+        last = np.diff(score, append=-np.inf) != 0
         score = score[last]
         found = found[last]
         precision = found / made[last]
