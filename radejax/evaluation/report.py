@@ -619,9 +619,7 @@ class PublishedRow:
         protocol: Evaluation protocol, or "not stated", as also in the next two fields.
         score_threshold: Predictions with a higher score were evaluated.
         region: Region of interest, "narrow" or "wide".
-        code: Repository of the method, "none", or "not stated".
         config: Config that trains the method, or "not trainable here".
-        note: Remark on the row.
         values: APs as printed. The class "mean" is the mAP of the source.
     """
 
@@ -633,9 +631,7 @@ class PublishedRow:
     protocol: str
     score_threshold: str
     region: str
-    code: str
     config: str
-    note: str
     values: dict[Cell, str]
 
     @property
@@ -665,7 +661,10 @@ class PublishedRow:
 
 
 def _read() -> tuple[PublishedRow, ...]:
-    """Reads the rows of `published.csv`."""
+    """Reads the rows of `published.csv`.
+
+    Its columns `code` (repository of the method) and `note` are for readers of the file.
+    """
     names = [field.name for field in dataclasses.fields(PublishedRow)][:-1]
     text = importlib.resources.files(__package__) / "published.csv"
     rows: dict[tuple[str, ...], PublishedRow] = {}
