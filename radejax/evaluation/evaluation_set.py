@@ -182,8 +182,6 @@ class EvaluationSet:
         self.label_version = label_version
         truth = boxes.read_boxes(ground_truth, "ground truth", scored=False)
         found = boxes.read_boxes(predictions, "predictions", scored=True)
-        boxes.require_sizes(truth, "ground truth")
-        boxes.require_sizes(found, "predictions")
         self.ground_truth = truth
         self.predictions = found
         if frames is None:
@@ -215,10 +213,11 @@ class EvaluationSet:
         self._cache: dict[tuple[object, ...], Any] = {}
 
     def _select(self, table: Boxes, name: str) -> tuple[Boxes, Int[np.ndarray, " N"]]:
-        """Returns the sorted boxes of the classes in the region, and their rows.
+        """Returns the checked and sorted boxes of the classes in the region, and their rows.
 
         The other boxes are counted in `left_out`.
         """
+        boxes.require_sizes(table, name)
         position = boxes.frame_positions(table.frame, self.frame, name)
         cls = boxes.class_indices(table, self.classes, name, self._known)
         is_class = cls >= 0
