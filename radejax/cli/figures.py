@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import pathlib
 import tempfile
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -106,13 +106,12 @@ def overlay(
         )
     is_animation = out.suffix.lower() == ".gif"
     found = found[: max_frames if is_animation else 1]
+    bar = tqdm.tqdm(found, "draw", unit="frame", disable=not is_animation)
+    figures = (_draw(frames, frame, slices, lidar, roi, detector) for frame in bar)
     if is_animation:
-        shown = tqdm.tqdm(found, "draw", unit="frame")
-        animate(
-            (_draw(frames, frame, slices, lidar, roi, detector) for frame in shown), out
-        )
+        animate(figures, out)
     else:
-        save_figure(_draw(frames, found[0], slices, lidar, roi, detector), out)
+        save_figure(next(figures), out)
     click.echo(f"drew {out}{'' if slices else _undrawn(found)}")
 
 
@@ -152,9 +151,8 @@ def _draw(
     from radejax.data.kradar.points import read_lidar
     from radejax.visualize.draw import draw_slices
 
-    grid = frames.grid if detector is None else detector.grid
     region = None if roi == "none" else roi
-    scene = _scene(frame, grid, detector, may_lack_radar=not slices, roi=region)
+    scene = _scene(frames, frame, detector, may_lack_radar=not slices, roi=region)
     if lidar:
         if not isinstance(frames, KRadar) or not isinstance(frame, Frame):
             raise UserError("--lidar draws K-Radar's os2-64/*.pcd: leave it out")
@@ -198,28 +196,11 @@ def view(
         )
     shown = complete[:max_frames]
     bar = tqdm.tqdm(shown, desc="record", unit="frame")
-    grid = frames.grid if detector is None else detector.grid
-    write_recording(viewer_scenes(bar, grid, detector), out)
+    write_recording((_scene(frames, frame, detector) for frame in bar), out)
     text = f"{len(shown)} frames written to {out}"
     if lacking := len(frames) - len(complete):
         text += f"; {lacking} without radar tensor or projection skipped"
     click.echo(text + _undrawn(shown))
-
-
-def viewer_scenes(
-    frames: Iterable[LabeledFrame],
-    grid: radejax.RadarGrid,
-    detector: radejax.Detector | None = None,
-) -> Iterator[radejax.Scene]:
-    """Yields the `Scene` of each frame, which is read when it is requested.
-
-    All frames must have radar data. With a detector, the scenes contain its predictions.
-    """
-    from radejax.data.kradar import Frame
-
-    for frame in frames:
-        time_s = frame.header.timestamp_s if isinstance(frame, Frame) else None
-        yield _scene(frame, grid, detector, time_s=time_s)
 
 
 def _open(
@@ -251,8 +232,8 @@ def _open(
 
 
 def _scene(
+    frames: LabeledFrames[LabeledFrame],
     frame: LabeledFrame,
-    grid: radejax.RadarGrid,
     detector: radejax.Detector | None,
     *,
     may_lack_radar: bool = False,
@@ -264,6 +245,9 @@ def _scene(
     """
     import numpy as np
 
+    from radejax.data.kradar import Frame
+
+    grid = frames.grid if detector is None else detector.grid
     try:
         projection = frame.read_projection(grid)
     except FileNotFoundError:
@@ -275,6 +259,8 @@ def _scene(
         image = None if camera is None else [frame.camera_path]
         fields["predictions"] = detector(projection, image, camera).to_boxes()
         fields["score_threshold"] = detector.decode_options.score_threshold
+    if isinstance(frame, Frame):
+        fields["time_s"] = frame.header.timestamp_s
     return radejax.frame_scene(frame, projection, grid, **fields)
 
 
@@ -311,18 +297,11 @@ def demo(out: pathlib.Path, seed: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         frames = radejax.KRadar([radejax.simulate(simulation, folder)])
         (frame,) = frames
-        projection = frame.read_projection(frames.grid)
         detector = radejax.Detector.from_workdir(MODEL)
-        found = detector(projection).to_boxes()
-        scene = radejax.frame_scene(
-            frame,
-            projection,
-            frames.grid,
-            predictions=found,
-            score_threshold=detector.decode_options.score_threshold,
-            roi=WIDE_ROI,
-            title=f"simulated frame, seed {seed}, {frame.weather}",
-        )
+        title = f"simulated frame, seed {seed}, {frame.weather}"
+        scene = _scene(frames, frame, detector, roi=WIDE_ROI, title=title)
+    assert scene.predictions is not None
+    num_found = len(scene.predictions)
     save_figure(radejax.draw_frame(scene), out)
     num_labeled = len(frame.boxes)
-    click.echo(f"{len(found)} boxes found, {num_labeled} labeled objects: see {out}")
+    click.echo(f"{num_found} boxes found, {num_labeled} labeled objects: see {out}")

@@ -226,7 +226,7 @@ def mistakes(data: EvaluationSet, iou: float) -> dict[str, Int[np.ndarray, "F C"
     own, best = np.zeros((2, len(data.pred)))
     for largest, of in ((own, data), (best, of_any_class)):
         np.maximum.at(largest, of.pair_pred, of.overlaps("plain")["3d"])
-    groups = {"missed": data.gt_group[is_missed]}
+    counts = {"missed": data.count_groups(data.gt_group[is_missed])}
     is_left = above & (match < 0)
     for kind, is_kind in (
         ("duplicate", own > iou),
@@ -234,13 +234,9 @@ def mistakes(data: EvaluationSet, iou: float) -> dict[str, Int[np.ndarray, "F C"
         ("poor box", own > 0),
         ("background", own >= 0),
     ):
-        groups[kind] = data.pred_group[is_left & is_kind]
+        counts[kind] = data.count_groups(data.pred_group[is_left & is_kind])
         is_left = is_left & ~is_kind
-    shape = data.frame.size, len(data.classes)
-    return {
-        kind: np.bincount(group, minlength=shape[0] * shape[1]).reshape(shape)
-        for kind, group in groups.items()
-    }
+    return counts
 
 
 def worst_frames(data: EvaluationSet, frames: Columns, iou: float) -> list[Entry]:

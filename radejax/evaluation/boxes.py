@@ -34,11 +34,12 @@ Roi = str | Sequence[float] | None
 """A region of interest: "narrow", "wide", (x0, x1, y0, y1, z0, z1), or None for all."""
 
 
-def roi_bounds(roi: Roi) -> tuple[float, ...] | None:
+def roi_bounds(roi: Roi, field: str = "roi") -> tuple[float, ...] | None:
     """Returns the bounds (x0, x1, y0, y1, z0, z1) of a named or given region of interest.
 
     Args:
         roi: One of `ROIS`, the bounds in meters in the radar frame, or None.
+        field: Name of the option for the error message.
 
     Raises:
         UserError: The name is unknown, or the bounds are not three increasing pairs.
@@ -50,11 +51,11 @@ def roi_bounds(roi: Roi) -> tuple[float, ...] | None:
     if roi is None:
         return None
     if isinstance(roi, str):
-        require(roi in ROIS, "roi", roi, f"one of {', '.join(ROIS)}")
+        require(roi in ROIS, field, roi, f"one of {', '.join(ROIS)}")
         return ROIS[roi]
     bounds = np.asarray(roi, np.float64).reshape(-1)
     is_valid = bounds.size == 6 and bool((bounds[::2] < bounds[1::2]).all())
-    require(is_valid, "roi", roi, "x0, x1, y0, y1, z0, z1 with increasing bounds")
+    require(is_valid, field, roi, "x0, x1, y0, y1, z0, z1 with increasing bounds")
     return tuple(bounds.tolist())
 
 
@@ -108,7 +109,8 @@ def columns_of_boxes(table: AnyBoxes) -> Columns:
 def read_boxes(table: AnyBoxes, name: str, *, scored: bool) -> Boxes:
     """Reads boxes from the columns frame, box, cls and, for predictions, score.
 
-    Further columns of numbers become `extras`.
+    Further columns of one number or array of numbers per box become `extras`, such as
+    calibrated probabilities and what own metrics need. Others are ignored.
 
     Args:
         table: Boxes, or columns by name.
@@ -131,9 +133,12 @@ def read_boxes(table: AnyBoxes, name: str, *, scored: bool) -> Boxes:
     box = columns["box"].astype(np.float64)
     box = box if frame.size else np.zeros((0, 7))  # an empty list has no width
     score = columns["score"].astype(np.float64) if scored else None
-    usual = ("frame", "box", "cls", "score")
-    others = {name: x for name, x in columns.items() if name not in usual}
-    extras = {name: x for name, x in others.items() if x.dtype.kind in "biuf"}
+    others = columns.keys() - set(column_names(scored=True))
+    extras = {
+        key: x
+        for key, x in columns.items()
+        if key in others and x.dtype.kind in "biuf" and x.shape[:1] == frame.shape
+    }
     try:
         return Boxes(frame, box, columns["cls"].astype(str), score, extras)
     except DataError as error:

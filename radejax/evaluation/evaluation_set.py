@@ -182,8 +182,6 @@ class EvaluationSet:
         self.label_version = label_version
         truth = boxes.read_boxes(ground_truth, "ground truth", scored=False)
         found = boxes.read_boxes(predictions, "predictions", scored=True)
-        boxes.require_sizes(truth, "ground truth")
-        boxes.require_sizes(found, "predictions")
         self.ground_truth = truth
         self.predictions = found
         if frames is None:
@@ -199,8 +197,8 @@ class EvaluationSet:
         self.score = self.pred.score
         self.gt_group = self.gt.frame * len(self.classes) + self.gt.cls
         self.pred_group = self.pred.frame * len(self.classes) + self.pred.cls
-        self.gt_count = self._count(self.gt_group)
-        pairs = self.gt_count * self._count(self.pred_group)
+        self.gt_count = self.count_groups(self.gt_group)
+        pairs = self.gt_count * self.count_groups(self.pred_group)
         if pairs.max(initial=0) > MAX_PAIRS:
             frame, cls = np.unravel_index(pairs.argmax(), pairs.shape)
             raise DataError(
@@ -215,10 +213,11 @@ class EvaluationSet:
         self._cache: dict[tuple[object, ...], Any] = {}
 
     def _select(self, table: Boxes, name: str) -> tuple[Boxes, Int[np.ndarray, " N"]]:
-        """Returns the sorted boxes of the classes in the region, and their rows.
+        """Returns the checked and sorted boxes of the classes in the region, and their rows.
 
         The other boxes are counted in `left_out`.
         """
+        boxes.require_sizes(table, name)
         position = boxes.frame_positions(table.frame, self.frame, name)
         cls = boxes.class_indices(table, self.classes, name, self._known)
         is_class = cls >= 0
@@ -228,12 +227,11 @@ class EvaluationSet:
         self.left_out[f"{name}: center outside the region of interest"] = num_outside
         row = np.flatnonzero(is_class & is_inside)
         row = row[np.lexsort((row, cls[row], position[row]))]
-        score = None if table.score is None else table.score[row]
-        extras = {name: x[row] for name, x in table.extras.items()}
-        return Boxes(position[row], table.box[row], cls[row], score, extras), row
+        found = table.take(row)
+        return dataclasses.replace(found, frame=position[row], cls=cls[row]), row
 
-    def _count(self, group: Int[np.ndarray, " N"]) -> Int[np.ndarray, "F C"]:
-        """Returns the number of boxes of every class in every frame."""
+    def count_groups(self, group: Int[np.ndarray, " N"]) -> Int[np.ndarray, "F C"]:
+        """Counts boxes by frame and class from rows of `gt_group` or `pred_group`."""
         shape = self.frame.size, len(self.classes)
         return np.bincount(group, minlength=shape[0] * shape[1]).reshape(shape)
 

@@ -101,14 +101,6 @@ def _read(
             f"{path} is neither a .npz or .json file nor a folder of `radejax detect` or in "
             "KITTI's layout"
         )
-    # Own metrics and calibrated probabilities need further columns.
-    shape = columns["frame"].shape
-    columns = {
-        name: x
-        for name, x in columns.items()
-        if name in column_names(scored)
-        or (x.dtype.kind in "biuf" and x.shape[:1] == shape)
-    }
     table = boxes.with_ids(columns, frames, str(path), skip=path.is_dir())
     return boxes.read_boxes(table, str(path), scored=scored), there
 
@@ -324,6 +316,25 @@ def known_classes(*paths: PathLike | None) -> set[str]:
     return {cls for one in stored for field in fields for cls in one.get(field, ())}
 
 
+def options_for(
+    paths: Sequence[PathLike], source: Source, options: ReportOptions
+) -> ReportOptions:
+    """Returns options with the classes of all paths, and the highest of their lowest scores.
+
+    Predictions below the lowest stored score of one path must not count for another one.
+
+    Args:
+        paths: Reports or predictions, see `load`.
+        source: Source of the ground truth.
+        options: Settings of the evaluation.
+    """
+    stored = [stored_options(path).get("min_score", 0.0) for path in paths]
+    known = known_classes(*paths, source.ground_truth).union(options.known_classes)
+    return options.replace(
+        min_score=max(options.min_score, *stored), known_classes=tuple(sorted(known))
+    )
+
+
 def _read_frames(path: PathLike) -> Columns:
     """Reads a frame table that `report.write_report` wrote."""
     content = files.read_json(path)
@@ -360,11 +371,7 @@ def evaluate_files(
             f"{path} has only predictions from score {low:g} on, and every number is of "
             "these; `radejax evaluate` with --min-score stores lower ones"
         )
-    known = known_classes(path, source.ground_truth)
-    options = options.replace(
-        min_score=max(low, options.min_score),
-        known_classes=tuple(sorted(known.union(options.known_classes))),
-    )
+    options = options_for([path], source, options)
     origin = Origin(run, left_out=left_out, warnings=warnings)
     warn_of_replaced(files.as_path(out_dir), run)
     return write_report(truth, found, frames, out_dir, options, origin)

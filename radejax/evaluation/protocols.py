@@ -86,8 +86,12 @@ _ALL = (
 PROTOCOLS = {protocol.name: protocol for protocol in _ALL}
 
 
-def get_protocol(name: str) -> Protocol:
+def get_protocol(name: str, field: str = "protocols") -> Protocol:
     """Returns the protocol of a name, or of "module:Object", which is then its name.
+
+    Args:
+        name: Name of the protocol.
+        field: Name of the option for the error message.
 
     Raises:
         UserError: There is no such protocol; the message lists all.
@@ -96,7 +100,7 @@ def get_protocol(name: str) -> Protocol:
         >>> get_protocol("kradar_r40").name
         'kradar_r40'
     """
-    found = find_part(name, "protocols", PROTOCOLS, Protocol)
+    found = find_part(name, field, PROTOCOLS, Protocol)
     return dataclasses.replace(found, name=name)
 
 
@@ -283,8 +287,7 @@ def pooled_curve(
     made = np.cumsum(weight)
     if curve == "all_point":
         # Equal scores are one threshold, so that their order does not matter.
-        last = np.ones(score.size, bool)
-        last[:-1] = score[1:] != score[:-1]
+        last = np.diff(score, append=-np.inf) != 0
         score = score[last]
         found = found[last]
         precision = found / made[last]

@@ -280,12 +280,8 @@ def _console_text(metrics: JsonObject, tables: RunTables) -> str:
 
 def describe(metrics: JsonObject) -> str:
     """Describes in one line where the numbers of metrics.json come from."""
-    known = {
-        "step": metrics["step"],
-        "data": metrics["data"],
-        "split": metrics["split"],
-    }
-    parts = [f"{name} {value}" for name, value in known.items() if value is not None]
+    known = [name for name in ("step", "data", "split") if metrics[name] is not None]
+    parts = [f"{name} {metrics[name]}" for name in known]
     parts += [f"radejax {metrics['radejax']}", f"commit {metrics['commit']}"]
     return ", ".join([*parts, metrics["date"]])
 
@@ -623,9 +619,7 @@ class PublishedRow:
         protocol: Evaluation protocol, or "not stated", as also in the next two fields.
         score_threshold: Predictions with a higher score were evaluated.
         region: Region of interest, "narrow" or "wide".
-        code: Repository of the method, "none", or "not stated".
         config: Config that trains the method, or "not trainable here".
-        note: Remark on the row.
         values: APs as printed. The class "mean" is the mAP of the source.
     """
 
@@ -637,9 +631,7 @@ class PublishedRow:
     protocol: str
     score_threshold: str
     region: str
-    code: str
     config: str
-    note: str
     values: dict[Cell, str]
 
     @property
@@ -669,7 +661,10 @@ class PublishedRow:
 
 
 def _read() -> tuple[PublishedRow, ...]:
-    """Reads the rows of `published.csv`."""
+    """Reads the rows of `published.csv`.
+
+    Its columns `code` (repository of the method) and `note` are for readers of the file.
+    """
     names = [field.name for field in dataclasses.fields(PublishedRow)][:-1]
     text = importlib.resources.files(__package__) / "published.csv"
     rows: dict[tuple[str, ...], PublishedRow] = {}

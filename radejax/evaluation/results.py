@@ -92,19 +92,13 @@ class EvaluationOptions(Options, section="config.evaluation"):
             is_different = len(set(values)) == len(values)
             require(is_different, f"config.evaluation.{name}", values, "different ones")
         self.find_protocols(name for name in self.protocols if ":" not in name)
-        try:
-            roi_bounds(self.roi)
-        except UserError as error:
-            raise UserError(f"config.evaluation.{error}") from None
+        roi_bounds(self.roi, "config.evaluation.roi")
         return self
 
     def find_protocols(self, names: Iterable[str] | None = None) -> None:
         """Raises `UserError` if one of the names (by default `protocols`) is not a protocol."""
-        try:
-            for name in self.protocols if names is None else names:
-                protocols.get_protocol(name)
-        except UserError as error:
-            raise UserError(f"config.evaluation.{error}") from None
+        for name in self.protocols if names is None else names:
+            protocols.get_protocol(name, "config.evaluation.protocols")
 
     def find_metrics(self) -> dict[str, Metric]:
         """Returns the functions of `metrics` by name.

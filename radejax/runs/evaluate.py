@@ -34,12 +34,7 @@ from radejax.evaluation.analysis import (
     mistakes,
     worst_frames,
 )
-from radejax.evaluation.boxes import (
-    class_indices,
-    roi_bounds,
-    roi_name,
-    tables_from_frames,
-)
+from radejax.evaluation.boxes import class_indices, roi_name, tables_from_frames
 from radejax.evaluation.evaluation_set import EvaluationSet, Result
 from radejax.evaluation.html import SceneFigure
 from radejax.evaluation.report import (
@@ -177,7 +172,9 @@ class Evaluation:
         main = f"{self._config.train.best_metric}/{self._options.protocols[0]}/"
         best = next((ap for name, ap in aps.items() if name.startswith(main)), math.nan)
         shown = self._spread(self._config.logging.num_visualizations)
-        drawn = devices.main_only(lambda: dict(self._figures(predictions, shown)))
+        drawn = devices.main_only(
+            lambda: dict(self._figure(predictions, index) for index in shown)
+        )
         means = {
             n: sum(float(x[n]) for x in losses) / len(self._frames) for n in losses[0]
         }
@@ -253,7 +250,7 @@ class Evaluation:
                 files.write_json(folder / "source.json", {"step": step, **self._source})
                 data_name = self._data.describe()["name"]
                 origin = f"{name}, step {step}, data {data_name}, split {self._split}"
-                draw_scenes = functools.partial(self._draw_scenes, predictions, origin)
+                draw_scenes = functools.partial(self._draw_scenes, origin)
                 report = write_report(
                     self._truth,
                     predictions,
@@ -285,11 +282,7 @@ class Evaluation:
         files.write_json(path, figures.average_shares(shares, grid))
 
     def _draw_scenes(
-        self,
-        predictions: Boxes,
-        origin: str,
-        data: EvaluationSet,
-        folder: pathlib.Path,
+        self, origin: str, data: EvaluationSet, folder: pathlib.Path
     ) -> Iterator[SceneFigure]:
         """Draws frames, writes figures of the usual and the worst ones, and yields all.
 
@@ -307,9 +300,8 @@ class Evaluation:
             indices += data.gt_count.argmax(axis=0).tolist()
             indices += [int(count.sum(axis=1).argmax()) for count in counts.values()]
         (folder / "worst_frames").mkdir()  # replaces that of an earlier evaluation
-        shown = list(dict.fromkeys(indices))
-        drawn = self._figures(predictions, shown)
-        for index, (name, figure) in zip(shown, drawn, strict=True):
+        for index in dict.fromkeys(indices):
+            name, figure = self._figure(data.predictions, index)
             for kind, among in (("figures", usual), ("worst_frames", worst)):
                 if index in among:
                     path = folder / kind / f"{name}.{self._options.figures}"
@@ -369,7 +361,7 @@ class Evaluation:
             decode(records[frame.key]),
             records.grid,
             predictions=predictions.take(is_drawn),
-            roi=roi_bounds(self._options.roi),
+            roi=self._options.roi,
             iou=self._options.iou_thresholds[0],
             score_threshold=threshold,
             **fields,
@@ -380,14 +372,11 @@ class Evaluation:
         candidates = [i for i, frame in enumerate(self._frames) if len(frame.boxes)]
         return figures.spread(candidates, count)
 
-    def _figures(
-        self, predictions: Boxes, indices: Sequence[int]
-    ) -> Iterator[tuple[str, Figure]]:
-        """Yields names and figures of frames by their positions in the split."""
-        for index in indices:
-            frame = self._frames[index]
-            name = f"{frame.sequence:02d}_{frame.name}"
-            yield name, draw_frame(self._scene(predictions, index))
+    def _figure(self, predictions: Boxes, index: int) -> tuple[str, Figure]:
+        """Returns name and figure of a frame by its position in the split."""
+        frame = self._frames[index]
+        name = f"{frame.sequence:02d}_{frame.name}"
+        return name, draw_frame(self._scene(predictions, index))
 
 
 def report_options(config: Config, **changes: Any) -> ReportOptions:

@@ -221,7 +221,7 @@ def draw_compared(
                 grid,
                 iou=options.iou_thresholds[0],
                 predictions=found.take(found.frame == ids[frame.key]),
-                roi=roi_bounds(options.roi),
+                roi=options.roi,
                 score_threshold=OPERATING_SCORE,
                 title=f"{name}: {weather} ({frame.key}){suffix}",
             )

@@ -79,14 +79,10 @@ def _draw_panel(
     ax.grid(alpha=0.3)
     if is_empty:
         ax.text(0.5, 0.5, "none found", transform=ax.transAxes, ha="center")
-    if not ax.lines:
-        return
-    ax.legend(  # below the axes, not to cover a curve
-        fontsize=7,
-        loc="upper center",
-        bbox_to_anchor=(0.5, -0.16),
-        frameon=False,
-    )
+    if ax.lines:  # the legend is below the axes, not to cover a curve
+        ax.legend(
+            fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.16), frameon=False
+        )
 
 
 def read_metrics(path: files.PathLike) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -156,12 +152,10 @@ def moving_mean(values: Float[np.ndarray, " N"], width: int) -> Float[np.ndarray
     There are fewer values at the start. The mean is NaN if none is finite.
     """
     is_finite = np.isfinite(values)
-    rows = np.stack([np.where(is_finite, values, 0.0), is_finite])
-    sums = np.cumsum(np.pad(rows, ((0, 0), (width, 0))), axis=1)
-    total, count = sums[:, width:] - sums[:, :-width]
-    means = np.full(values.shape, np.nan)
-    np.divide(total, count, out=means, where=count > 0)
-    return means
+    window = np.ones(width)
+    total = np.convolve(np.where(is_finite, values, 0.0), window)[: values.size]
+    count = np.convolve(is_finite, window)[: values.size]
+    return total / np.where(count > 0, count, np.nan)
 
 
 def _line(i: int) -> dict[str, Any]:

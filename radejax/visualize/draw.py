@@ -331,13 +331,13 @@ def draw_samples(
             _draw_ground(shown, ax=ax, label="normalized log power")
         extent = _extent_m(scene.grid, scene.roi)
         draw_map(target, grid, ax=row[2], extent=extent, label="target")
-        titles = frame.title, scene.title, "target heatmap, max over classes"
-        for ax, title in zip(row, titles, strict=False):
-            ax.set_title(title, fontsize=9)
+        titles = [frame.title, scene.title, "target heatmap, max over classes"]
         if scene.image is not None:
             _draw_view(row[3], scene)
-            row[3].set_title("image that the network gets", fontsize=9)
-        for ax in row[4 if scene.image is not None else 3 :]:
+            titles.append("image that the network gets")
+        for ax, title in zip(row, titles, strict=False):
+            ax.set_title(title, fontsize=9)
+        for ax in row[len(titles) :]:
             ax.set_axis_off()
     return figure
 

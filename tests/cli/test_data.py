@@ -10,8 +10,8 @@ import click.testing
 import numpy as np
 import pytest
 
-from radejax import Detector, KRadar, models
-from radejax.cli import figures, main
+from radejax import Detector, KRadar, frame_scene, models
+from radejax.cli import main
 from radejax.core.errors import DataError, UserError
 from radejax.data.kradar.tesseract import read_tesseract
 from radejax.data.records import Records
@@ -98,7 +98,8 @@ def test_frames_are_checked_preprocessed_and_drawn(
     _run("overlay", min(opened.keys()), *data, "--slices", "--out", out)
     assert out.stat().st_size > 10_000
     frames = KRadar(roots, labels, visibility=None)
-    (scene,) = figures.viewer_scenes([frames[0]], frames.grid)
+    projection = frames[0].read_projection(frames.grid)
+    scene = frame_scene(frames[0], projection, frames.grid)
     assert scene.image is not None
 
 

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.special import expit
 
 from radejax.config import load_config
 from radejax.core.structures import WIDE_ROI, DetectionMaps
 from radejax.detection import decode as D
-from radejax.evaluation.scores import calibrated
 from radejax.geometry.boxes import boxes7_from_8
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -198,9 +198,9 @@ def test_probabilities_are_a_further_output():
     rows = plain.is_valid
     assert rows.sum() == 4
     assert not probability[~rows].any()
-    for cls, fit in enumerate(fits):
+    for cls, (temperature, offset) in enumerate(fits):
         mine = rows & (plain.classes == cls)
-        expected = calibrated(plain.scores[mine], *fit)
+        expected = expit(logit(plain.scores[mine]) / temperature + offset)
         np.testing.assert_allclose(probability[mine], expected, rtol=1e-5)
     sure = DetectionMaps(jnp.asarray(logits).at[0, 4, 0, 0].set(99), maps.box_params)
     certain = decode(sure, GRID, calibration=fits)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.special import expit, logit
 
 from radejax.evaluation import scores
 from radejax.evaluation.evaluation_set import EvaluationSet
@@ -73,10 +74,14 @@ def test_calibration_error_by_hand():
     assert math.isnan(nothing.error)
 
 
+def _calibrated(score, temperature, offset):
+    return expit(logit(score) / temperature + offset)
+
+
 def _drawn(rng, temperature, offset, size=20_000):
     """Scores, and matches with the probabilities of this temperature and offset."""
     score = rng.uniform(0.05, 0.95, size)
-    return score, rng.random(size) < scores.calibrated(score, temperature, offset)
+    return score, rng.random(size) < _calibrated(score, temperature, offset)
 
 
 @pytest.mark.parametrize(("temperature", "offset"), [(0.4, -1.0), (1.0, 0.0), (3, 2)])
@@ -85,7 +90,7 @@ def test_fitted_temperature_and_offset_are_those_of_the_matches(temperature, off
     found = scores.fit_calibration(*_drawn(rng, temperature, offset))
     np.testing.assert_allclose(found, (temperature, offset), atol=0.1, rtol=0.1)
     score, is_matched = _drawn(rng, temperature, offset)
-    probability = scores.calibrated(score, *found)
+    probability = _calibrated(score, *found)
     assert scores.reliability(probability, is_matched).error < 0.015
     np.testing.assert_array_equal(np.argsort(probability), np.argsort(score))
 
@@ -95,7 +100,7 @@ def test_fits_of_few_predictions_are_finite():
     for is_matched in (np.ones(4, bool), np.zeros(4, bool), score < 0.5):
         temperature, offset = scores.fit_calibration(score, is_matched)
         assert temperature > 0  # also if high scores match less often
-        probability = scores.calibrated(score[:3], temperature, offset)
+        probability = _calibrated(score[:3], temperature, offset)
         assert np.abs(probability - is_matched[:3].mean()).max() < 0.55
         assert ((probability > 0) & (probability < 1)).all()
     assert scores.fit_calibration(score[:0], score[:0] > 0) == (1.0, 0.0)
@@ -117,5 +122,5 @@ def test_every_class_is_fitted_to_its_own_predictions():
     fits = scores.fit_calibrations(data, 0.5)
     assert [*fits] == ["Bicycle", "Sedan"]
     for cls, expected in (("Sedan", 0.9), ("Bicycle", 0.2)):
-        probability = scores.calibrated(found["score"], *fits[cls])
+        probability = _calibrated(found["score"], *fits[cls])
         assert probability.mean() == pytest.approx(expected, abs=0.1)
