@@ -6,7 +6,6 @@ rows that contain a detection, and the number of truncated detections.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from typing import Literal
 
@@ -167,18 +166,16 @@ def decode(
     )
     least_m = MIN_SIZE_M if options.clip_sizes else -jnp.inf
     boxes = peaks.boxes.at[..., 3:6].max(least_m)
-    peaks = dataclasses.replace(peaks, boxes=boxes)
-    keep = suppress(
-        peaks,
+    keep = rotated_nms(
+        boxes7_from_8(boxes) if options.raw_yaw == "never" else boxes,
+        peaks.is_valid,
         options.nms_iou if nms_iou is None else nms_iou,
-        per_class=options.per_class_nms,
-        normalize_yaw=options.raw_yaw == "never",
+        classes=peaks.classes if options.per_class_nms else None,
     )
     if options.raw_yaw == "always":
         length = jnp.linalg.norm(boxes[..., 6:8], axis=-1, keepdims=True)
         boxes = boxes.at[..., 3:5].multiply(length).at[..., 3:6].max(least_m)
-        peaks = dataclasses.replace(peaks, boxes=boxes)
-    found = _compact(peaks, keep, options.max_detections)
+    found = _compact(peaks.replace(boxes=boxes), keep, options.max_detections)
     if options.calibration is None:
         return found
     temperature, offset = jnp.array(options.calibration, jnp.float32).T
@@ -188,37 +185,6 @@ def decode(
         logits / temperature[found.classes] + offset[found.classes]
     )
     return found.replace(outputs=found.outputs | {"probability": probability})
-
-
-def suppress(
-    peaks: Peaks,
-    nms_iou: Scalar,
-    *,
-    per_class: bool = False,
-    normalize_yaw: bool = False,
-) -> Bool[jax.Array, "B P"]:
-    """Returns a mask of the peaks that survive rotated NMS.
-
-    Args:
-        peaks: Peaks by descending score.
-        nms_iou: IoU at or above which the box with the lower score is removed.
-        per_class: Whether only boxes of the same class suppress each other.
-        normalize_yaw: Whether to normalize the yaw vectors, so that their length does not
-            scale the boxes.
-
-    Returns:
-        `[B, P]` bool, True where a peak is kept.
-
-    Examples:
-        >>> boxes = jnp.array([[[0.0, 0, 0, 4, 2, 1, 0, 1], [0.5, 0, 0, 4, 2, 1, 0, 1]]])
-        >>> zeros, ones = jnp.zeros((1, 2), int), jnp.ones((1, 2), bool)
-        >>> peaks = Peaks(jnp.zeros((1, 2, 2), int), boxes, ones, zeros, ones, jnp.array([2]))
-        >>> jax.jit(suppress)(peaks, 0.3).tolist()
-        [[True, False]]
-    """
-    boxes = boxes7_from_8(peaks.boxes) if normalize_yaw else peaks.boxes
-    classes = peaks.classes if per_class else None
-    return rotated_nms(boxes, peaks.is_valid, nms_iou, classes=classes)
 
 
 def find_peaks(

@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float, Int, Num, Shaped
 from radejax.core.errors import require
 from radejax.core.options import NotNegative, Options, Positive, find_function
 from radejax.core.structures import Batch, DetectionMaps
-from radejax.detection.decode import DecodeOptions, find_peaks, rows_at, suppress
-from radejax.detection.nms import match_boxes
+from radejax.detection.decode import DecodeOptions, find_peaks, rows_at
+from radejax.detection.nms import match_boxes, rotated_nms
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.focal import SigmaMode, focal_loss, gaussian_heatmap
 from radejax.losses.gwd import Transform, gwd_loss
@@ -337,7 +337,8 @@ def _after_nms(
         score_threshold=decoding.score_threshold,
         threshold_inclusive=decoding.threshold_inclusive,
     )
-    keep = suppress(peaks, decoding.nms_iou, per_class=decoding.per_class_nms)
+    classes = peaks.classes if decoding.per_class_nms else None
+    keep = rotated_nms(peaks.boxes, peaks.is_valid, decoding.nms_iou, classes=classes)
     match = jax.vmap(match_boxes)
     object_idx, is_matched = match(peaks.boxes, keep, boxes, is_valid)
     return peaks.bins, object_idx, is_matched
