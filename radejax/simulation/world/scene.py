@@ -252,15 +252,10 @@ def wrap_angle(angle_rad: Values) -> Values:
     return (angle_rad + np.pi) % (2.0 * np.pi) - np.pi
 
 
-def rotate(x: Values, y: Values, angle_rad: Broadcast) -> tuple[Values, Values]:
-    """Rotates vectors in the ground plane counter-clockwise."""
-    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
-    return cos * x - sin * y, sin * x + cos * y
-
-
 def turned(
     vectors: Float[np.ndarray, "*all D"], angle_rad: Broadcast
 ) -> Float[np.ndarray, "*all D"]:
     """Rotates vectors of two or three components counter-clockwise about the z axis."""
     x, y, *z = np.moveaxis(vectors, -1, 0)
-    return np.stack([*rotate(x, y, angle_rad), *z], -1)
+    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
+    return np.stack([cos * x - sin * y, sin * x + cos * y, *z], -1)
