@@ -240,7 +240,7 @@ class Writer:
         compute = functools.partial(
             tensor.simulate,
             grid=self.options.make_grid(),
-            parameters=self.options.make_parameters(),
+            parameters=self.options.radar.make_parameters(),
             output=self.options.output,
         )
         with contextlib.closing(self._prepared(num_workers, missing)) as frames:

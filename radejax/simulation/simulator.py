@@ -71,7 +71,7 @@ class SequenceSimulator:
         self.sequence = sequence
         self.options = options
         self.grid = options.make_grid()
-        self.parameters = options.make_parameters()
+        self.parameters = options.radar.make_parameters()
         rng = np.random.default_rng([options.seed, sequence.name, 11])
         tracks = sequence.tracks
         sizes_m = np.median(tracks.size_m, axis=0)
