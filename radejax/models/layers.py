@@ -109,8 +109,6 @@ class Conv(Layer):
         x = jnp.asarray(x, self.dtype)
         if self.stride == 1:
             y = conv2d(x, kernel, self.dilation)
-        elif self.size == 1:
-            y = conv2d(x[:, :: self.stride, :: self.stride], kernel)
         else:
             y = plain_conv2d(x, kernel, stride=self.stride)
         if self.use_bias:
