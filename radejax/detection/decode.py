@@ -32,7 +32,6 @@ from radejax.geometry.radar_grid import RadarGrid
 Scalar = float | Float[Array, ""]
 Thresholds = Scalar | Sequence[float] | Float[Array, " C"]
 Roi = Real[Array, "6"] | Sequence[Scalar]
-RawYaw = Literal["nms", "always", "never"]
 
 
 class DecodeOptions(Options, section="config.decode"):
@@ -51,7 +50,7 @@ class DecodeOptions(Options, section="config.decode"):
     roi: tuple[float, ...] | None = None
     """Region of interest: x0, x1, y0, y1, z0, z1 in meters. Boxes whose center is
     outside are removed before NMS. None: everywhere."""
-    raw_yaw: RawYaw = "nms"
+    raw_yaw: Literal["nms", "always", "never"] = "nms"
     """Where the length of the regressed (sin, cos) vector scales length and width: nms (in
     NMS only), always (in the results too, as in the released evaluator), never."""
     calibration: tuple[tuple[Positive, float], ...] | None = None

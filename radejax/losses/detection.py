@@ -21,7 +21,6 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.focal import SigmaMode, focal_loss, gaussian_heatmap
 from radejax.losses.gwd import Transform, gwd_loss
 
-Assignment = Literal["center", "nms"]
 Scalar = Num[jax.Array, ""]
 Maps = Float[jax.Array, "B R A C"]
 Boxes8 = Float[jax.Array, "B N 8"]
@@ -47,7 +46,7 @@ class LossOptions(Options, section="config.loss"):
     """Normalize the predicted yaw vector before the Wasserstein distance. The authors' code
     does not. Smooth L1 always uses the raw vector, so that the network learns to predict
     unit length."""
-    assignment: Assignment = "center"
+    assignment: Literal["center", "nms"] = "center"
     """Boxes of the regression losses: center (predictions at the objects' own bins, as
     released) or nms (predictions that overlap an object after NMS, with the thresholds of
     decode, as in the paper)."""

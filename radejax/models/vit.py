@@ -194,23 +194,22 @@ def bicubic_weights(
     return rounded
 
 
-def rotary_angles(rows: int, columns: int, head_dim: int, theta: float = 100.0) -> Rope:
+def rotary_angles(rows: int, columns: int, head_dim: int) -> Rope:
     """Computes the rotary position embedding of a grid of patches.
 
     The coordinates p of patch centers are in [-1, 1] along each axis. The first quarter of
     a head's channels encodes the row, the second quarter the column, and the second half
-    repeats both. Channel i of a quarter has the angle `2 pi p / theta^(4 i / head_dim)`.
+    repeats both. Channel i of a quarter has the angle `2 pi p / 100^(4 i / head_dim)`.
 
     Args:
         rows: Number of patches along the height.
         columns: Number of patches along the width.
         head_dim: Channels of a head, a multiple of 4.
-        theta: Base of the wavelengths.
 
     Returns:
         Cosines and sines of the angles, two float32 arrays `[rows * columns, head_dim]`.
     """
-    frequency = theta ** -(np.arange(head_dim // 4) * 4.0 / head_dim)
+    frequency = 100.0 ** -(np.arange(head_dim // 4) * 4.0 / head_dim)
 
     def axis_angles(count: int) -> np.ndarray:
         position = 2.0 * (np.arange(count) + 0.5) / count - 1.0
