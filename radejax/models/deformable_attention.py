@@ -218,8 +218,7 @@ def lifted_attention(
             return _lifted_head(chunk_sizes, value, per_bin, tuple(biases))
 
         by_head = (value, offsets, logits, offset_bias, logit_bias)
-        attention: jax.Array = jax.lax.map(head, by_head)
-        return attention
+        return jax.lax.map(head, by_head)
 
     arrays = (value, offsets, logits, *geometry)
     if b == 1:  # on a CPU, the gradient of a batch of one is slower
@@ -260,8 +259,7 @@ def _by_chunk(
     by_platform = {
         platform: functools.partial(function, size) for platform, size in chunk_sizes
     }
-    result: T = jax.lax.platform_dependent(*arrays, **by_platform)
-    return result
+    return jax.lax.platform_dependent(*arrays, **by_platform)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
@@ -428,5 +426,4 @@ def _to_chunks(arrays: T, size: int) -> T:
         padded = jnp.pad(x, [(0, -bins % size)] + [(0, 0)] * (x.ndim - 1))
         return padded.reshape(-1, size, *x.shape[1:])
 
-    chunks: T = jax.tree.map(split, arrays)
-    return chunks
+    return jax.tree.map(split, arrays)

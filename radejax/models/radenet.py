@@ -83,7 +83,7 @@ class RadeNet(nn.Module):
         """Applies the backbone."""
         options = self.options
         backbone = find_part(options.backbone, "config.model.backbone", BACKBONES)
-        features: Map = self._stage(backbone)(
+        return self._stage(backbone)(
             doppler_bins=self.num_frames * options.doppler_bins,
             widths=options.widths,
             decoder_width=options.decoder_width,
@@ -92,7 +92,6 @@ class RadeNet(nn.Module):
             **self._shared(),
             name="backbone",
         )(padded)
-        return features
 
     def _maps(
         self, features: Float[jax.Array, "B Rp Ap C"], projection: Projection

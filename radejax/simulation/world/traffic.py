@@ -131,8 +131,7 @@ class _Traffic:
 
     def _size(self, cls: str) -> Size:
         mean, deviation = np.array(SIZES[cls])
-        size: Size = mean + deviation * self.rng.normal(size=3).clip(-2, 2)
-        return size
+        return mean + deviation * self.rng.normal(size=3).clip(-2, 2)
 
     def _vehicle_class(self) -> str:
         law = self.law
