@@ -39,20 +39,22 @@ class DinoRade(RadeNet):
     options: DinoRadeOptions
 
     def setup(self) -> None:
-        shared = self._shared()
-        dtype = shared["dtype"]
-        width = self.options.decoder_width
-        image = self.options.image
+        options = self.options
+        image = options.image
+        width = options.decoder_width
+        dtype = jnp.dtype(options.dtype)
+        remat = options.remat != "none"
         if image.kind == "vit":
-            remat = shared["remat"] and not image.freeze
             self.image_backbone: ResNetTrunk | ViT = ViT(
-                image, dtype=dtype, remat=remat
+                image, dtype=dtype, remat=remat and not image.freeze
             )
             self.image_neck: ResNetNeck | CameraNeck = CameraNeck(width, dtype=dtype)
         else:
             self.image_backbone = ResNetTrunk(image.resnet_width, dtype=dtype)
             self.image_neck = ResNetNeck(width, image.resnet_width, dtype=dtype)
-        self.image_fusion = Fusion(self.options.fusion, **shared)
+        self.image_fusion = Fusion(
+            options.fusion, num_groups=options.num_groups, dtype=dtype, remat=remat
+        )
 
     @nn.compact
     def __call__(

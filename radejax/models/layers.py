@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from typing import TypedDict
 
 import flax.linen as nn
 import jax
@@ -59,14 +58,6 @@ class Layer(nn.Module, kw_only=True):
     """
 
     dtype: DTypeLike = jnp.float32
-
-
-class PartFields(TypedDict):
-    """The fields of a `Part`, by name."""
-
-    num_groups: int
-    dtype: DTypeLike
-    remat: bool
 
 
 class Part(Layer, kw_only=True):
