@@ -94,7 +94,7 @@ def torch_state(model, variables):
     state = convert.to_torch(rules, {**variables, "params": params})
     for name in [n for n in state if n.endswith(".running_var")]:
         state[name.replace("running_var", "num_batches_tracked")] = np.array(0)
-    rows, columns, channels = model.feature_shape
+    rows, columns, channels = model.options.image.feature_shape
     angles = rotary_angles(rows, columns, channels // vit.num_heads)
     names = ("image_backbone.cos", "image_backbone.sin")
     return state | dict(zip(names, map(np.asarray, angles), strict=True))

@@ -111,7 +111,7 @@ def test_what_is_computed_before_gives_the_same_prediction():
     params = dict(variables["params"])
     backbone = {"params": {"image_backbone": params.pop("image_backbone")}}
     features = jax.jit(functools.partial(model.apply, method="embed"))(backbone, image)
-    chex.assert_shape(features, (B, *model.feature_shape))
+    chex.assert_shape(features, (B, *model.options.image.feature_shape))
     found = applied()(variables | {"params": params}, projection, features, camera)
     chex.assert_trees_all_close(found, expected, atol=2e-6)
 
