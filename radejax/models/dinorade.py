@@ -91,10 +91,7 @@ class DinoRade(RadeNet):
             reference = self._reference(camera, padded.shape)
             camera_map = self._camera_map(image, reference, train)
         elif image is not None or camera is not None:
-            raise UserError(
-                f"{'camera' if image is None else 'image'} is given without "
-                f"{'image' if image is None else 'camera'}: give both or none"
-            )
+            raise UserError("image and camera belong together: give both or none")
         x = self._features(padded)
         channels = padded.shape[-1] - self.options.elevation_bins
         elevation = padded[..., channels:]  # of the last frame

@@ -173,8 +173,8 @@ def test_images_of_another_size_are_rejected():
     short = references(model, calibration().camera(), 4)
     for message, arguments in (
         (r"\(2, 32, 32, 3\), expected \('B', 32, 48", (image[:, :, :32], camera)),
-        ("camera is given without image", (None, camera)),
-        ("image is given without camera", (image,)),
+        ("image and camera belong together", (None, camera)),
+        ("image and camera belong together", (image,)),
         (r"reference points are \(1, 4, 8, 3\), expected", (image, short)),
     ):
         with pytest.raises(UserError, match=message):
