@@ -215,7 +215,7 @@ def lifted_attention(
         def head(arrays: tuple[jax.Array, ...]) -> jax.Array:
             value, offsets, logits, *biases = arrays
             per_bin = (offsets, logits, *shared)
-            return _lifted_head(chunk_sizes, value, per_bin, tuple(biases))
+            return _lifted_head(chunk_sizes, (value, per_bin, tuple(biases)))
 
         by_head = (value, offsets, logits, offset_bias, logit_bias)
         return jax.lax.map(head, by_head)
@@ -246,7 +246,7 @@ def _chunk_sizes(given: int, batch_size: object) -> ChunkSizes:
 
 
 def _by_chunk(
-    function: Callable[..., T], chunk_sizes: ChunkSizes, *arrays: jax.Array | Arrays
+    function: Callable[..., T], chunk_sizes: ChunkSizes, *arrays: HeadInputs | jax.Array
 ) -> T:
     """Calls `function(chunk_size, *arrays)` with the chunk size of the platform.
 
@@ -263,20 +263,18 @@ def _by_chunk(
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _lifted_head(
-    chunk_sizes: ChunkSizes, value: jax.Array, per_bin: Arrays, biases: Arrays
-) -> jax.Array:
+def _lifted_head(chunk_sizes: ChunkSizes, inputs: HeadInputs) -> jax.Array:
     """Computes the attention `[N, D]` of one head of one sample.
 
-    `value` is `[H, W, D]`, `per_bin` contains offsets, logits, scale, reference and
-    query weights, and `biases` the two biases, all as in `lifted_attention`.
+    The map is `[H, W, D]`. The values per bin are offsets, logits, scale, reference and
+    query weights, and the biases those of offsets and logits, all as in
+    `lifted_attention`.
     """
-    return _by_chunk(_head_forward, chunk_sizes, value, per_bin, biases)
+    return _by_chunk(_head_forward, chunk_sizes, inputs)
 
 
-def _head_forward(
-    chunk_size: int, value: jax.Array, per_bin: Arrays, biases: Arrays
-) -> jax.Array:
+def _head_forward(chunk_size: int, inputs: HeadInputs) -> jax.Array:
+    value, per_bin, biases = inputs
     pixels = value.reshape(-1, value.shape[-1])
 
     def chunk(parts: Arrays) -> jax.Array:
@@ -293,21 +291,19 @@ def _head_forward(
 
 
 def _lifted_head_forward(
-    chunk_sizes: ChunkSizes, value: jax.Array, per_bin: Arrays, biases: Arrays
+    chunk_sizes: ChunkSizes, inputs: HeadInputs
 ) -> tuple[jax.Array, HeadInputs]:
-    out = _lifted_head(chunk_sizes, value, per_bin, biases)
-    return out, (value, per_bin, biases)
+    return _lifted_head(chunk_sizes, inputs), inputs
 
 
 def _lifted_head_backward(
-    chunk_sizes: ChunkSizes, saved: HeadInputs, grad: jax.Array
-) -> HeadInputs:
-    return _by_chunk(_head_backward, chunk_sizes, grad, *saved)
+    chunk_sizes: ChunkSizes, inputs: HeadInputs, grad: jax.Array
+) -> tuple[HeadInputs]:
+    return (_by_chunk(_head_backward, chunk_sizes, inputs, grad),)
 
 
-def _head_backward(
-    chunk_size: int, grad: jax.Array, value: jax.Array, per_bin: Arrays, biases: Arrays
-) -> HeadInputs:
+def _head_backward(chunk_size: int, inputs: HeadInputs, grad: jax.Array) -> HeadInputs:
+    value, per_bin, biases = inputs
     pixels = value.reshape(-1, value.shape[-1])
     samples = functools.partial(_lifted_samples, value.shape[:2])
 
