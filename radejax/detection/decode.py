@@ -18,13 +18,7 @@ from flax import struct
 from jaxtyping import Bool, Float, Int, Num, Real, Shaped
 
 from radejax.core.errors import require
-from radejax.core.options import (
-    AtLeastOne,
-    Fraction,
-    Options,
-    Positive,
-    ScoreThreshold,
-)
+from radejax.core.options import AtLeastOne, Fraction, Options, Positive, ScoreThreshold
 from radejax.core.structures import MIN_SIZE_M, Array, DetectionMaps, Detections
 from radejax.detection.nms import rotated_nms
 from radejax.geometry.boxes import boxes7_from_8
