@@ -182,7 +182,8 @@ class Sequence:
         centers = turned(tracks.position_m[index] - origin, -heading)
         is_near = np.hypot(centers[:, 0], centers[:, 1]) < max_distance_m
         chosen = np.flatnonzero(tracks.is_present[index] & is_near)
-        yaw = wrap_angle(tracks.yaw_rad[index] - heading)
+        turn = tracks.yaw_rad[index] - heading
+        yaw = (turn + np.pi) % (2.0 * np.pi) - np.pi  # in [-pi, pi)
         boxes = np.concatenate([centers, tracks.size_m[index], yaw[:, None]], 1)
         points = turned(fixed.position_m - origin, -heading)
         distance = np.hypot(points[:, 0], points[:, 1])
@@ -243,11 +244,6 @@ def is_blocked(
     crosses = (enter < leave) & (leave > 0) & (enter < 1.0) & (enter > 0)
     crosses &= np.arange(len(boxes))[None] != owner[:, None]
     return crosses.any(1)
-
-
-def wrap_angle(angle_rad: Values) -> Values:
-    """Wraps angles to [-pi, pi)."""
-    return (angle_rad + np.pi) % (2.0 * np.pi) - np.pi
 
 
 def turned(
