@@ -98,7 +98,7 @@ def simulator_of(weather="rain"):
     options = SimulationOptions(**FULL_SIZE)
     rng = np.random.default_rng(len(weather))
     sequence = make_sequence(1, ("urban", "day", weather), 1, rng)
-    grid, parameters = options.make_grid(), options.make_parameters()
+    grid, parameters = options.make_grid(), options.radar.make_parameters()
     simulator = SequenceSimulator(sequence, options)
     arrays = simulator.radar_input(sequence.frame(0)).arrays
     return arrays, functools.partial(tensor.simulate, grid=grid, parameters=parameters)

@@ -20,7 +20,7 @@ from radejax import models
 from radejax.config import load_config
 from radejax.data.pipeline import LoaderOptions, make_loader, make_table
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.models.deformable_attention import DeformableAttention
+from radejax.models.deformable_attention import DeformableAttention, Queries
 from radejax.models.lifting import ReferencePoints, reference_points
 from radejax.models.vit import rotary_angles
 from radejax.training.step import create_state, make_optimizer, make_train_step
@@ -94,7 +94,7 @@ def torch_state(model, variables):
     state = convert.to_torch(rules, {**variables, "params": params})
     for name in [n for n in state if n.endswith(".running_var")]:
         state[name.replace("running_var", "num_batches_tracked")] = np.array(0)
-    rows, columns, channels = model.feature_shape
+    rows, columns, channels = model.options.image.feature_shape
     angles = rotary_angles(rows, columns, channels // vit.num_heads)
     names = ("image_backbone.cos", "image_backbone.sin")
     return state | dict(zip(names, map(np.asarray, angles), strict=True))
@@ -352,7 +352,8 @@ def attention(machine):
     def ours(params, feature, scale, places, value):
         module = DeformableAttention(*ATTENTION)
         mean = jnp.full(places.shape[:-1], 1 / elevation)
-        return module.apply({"params": params}, feature, scale, places, mean, value)
+        queries = Queries(scale, places, mean)
+        return module.apply({"params": params}, feature, queries, value)
 
     arrays = jax.device_put((params, *given))
     program, cost = compiled(ours, *arrays, precision="highest")

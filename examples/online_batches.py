@@ -55,7 +55,7 @@ class OnlineBatches:
     ) -> None:
         self._options = options
         self.grid = options.make_grid()
-        self._parameters = options.make_parameters()
+        self._parameters = options.radar.make_parameters()
         self._source = make_source(options)
         self._specs = [
             (number, spec)

@@ -6,7 +6,7 @@ rows that contain a detection, and the number of truncated detections.
 
 from __future__ import annotations
 
-import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Literal
 
@@ -18,13 +18,7 @@ from flax import struct
 from jaxtyping import Bool, Float, Int, Num, Real, Shaped
 
 from radejax.core.errors import require
-from radejax.core.options import (
-    AtLeastOne,
-    Fraction,
-    Options,
-    Positive,
-    ScoreThreshold,
-)
+from radejax.core.options import AtLeastOne, Fraction, Options, Positive, ScoreThreshold
 from radejax.core.structures import MIN_SIZE_M, Array, DetectionMaps, Detections
 from radejax.detection.nms import rotated_nms
 from radejax.geometry.boxes import boxes7_from_8
@@ -33,7 +27,6 @@ from radejax.geometry.radar_grid import RadarGrid
 Scalar = float | Float[Array, ""]
 Thresholds = Scalar | Sequence[float] | Float[Array, " C"]
 Roi = Real[Array, "6"] | Sequence[Scalar]
-RawYaw = Literal["nms", "always", "never"]
 
 
 class DecodeOptions(Options, section="config.decode"):
@@ -52,7 +45,7 @@ class DecodeOptions(Options, section="config.decode"):
     roi: tuple[float, ...] | None = None
     """Region of interest: x0, x1, y0, y1, z0, z1 in meters. Boxes whose center is
     outside are removed before NMS. None: everywhere."""
-    raw_yaw: RawYaw = "nms"
+    raw_yaw: Literal["nms", "always", "never"] = "nms"
     """Where the length of the regressed (sin, cos) vector scales length and width: nms (in
     NMS only), always (in the results too, as in the released evaluator), never."""
     calibration: tuple[tuple[Positive, float], ...] | None = None
@@ -167,18 +160,16 @@ def decode(
     )
     least_m = MIN_SIZE_M if options.clip_sizes else -jnp.inf
     boxes = peaks.boxes.at[..., 3:6].max(least_m)
-    peaks = dataclasses.replace(peaks, boxes=boxes)
-    keep = suppress(
-        peaks,
+    keep = rotated_nms(
+        boxes7_from_8(boxes) if options.raw_yaw == "never" else boxes,
+        peaks.is_valid,
         options.nms_iou if nms_iou is None else nms_iou,
-        per_class=options.per_class_nms,
-        normalize_yaw=options.raw_yaw == "never",
+        classes=peaks.classes if options.per_class_nms else None,
     )
     if options.raw_yaw == "always":
         length = jnp.linalg.norm(boxes[..., 6:8], axis=-1, keepdims=True)
         boxes = boxes.at[..., 3:5].multiply(length).at[..., 3:6].max(least_m)
-        peaks = dataclasses.replace(peaks, boxes=boxes)
-    found = _compact(peaks, keep, options.max_detections)
+    found = _compact(peaks.replace(boxes=boxes), keep, options.max_detections)
     if options.calibration is None:
         return found
     temperature, offset = jnp.array(options.calibration, jnp.float32).T
@@ -188,37 +179,6 @@ def decode(
         logits / temperature[found.classes] + offset[found.classes]
     )
     return found.replace(outputs=found.outputs | {"probability": probability})
-
-
-def suppress(
-    peaks: Peaks,
-    nms_iou: Scalar,
-    *,
-    per_class: bool = False,
-    normalize_yaw: bool = False,
-) -> Bool[jax.Array, "B P"]:
-    """Returns a mask of the peaks that survive rotated NMS.
-
-    Args:
-        peaks: Peaks by descending score.
-        nms_iou: IoU at or above which the box with the lower score is removed.
-        per_class: Whether only boxes of the same class suppress each other.
-        normalize_yaw: Whether to normalize the yaw vectors, so that their length does not
-            scale the boxes.
-
-    Returns:
-        `[B, P]` bool, True where a peak is kept.
-
-    Examples:
-        >>> boxes = jnp.array([[[0.0, 0, 0, 4, 2, 1, 0, 1], [0.5, 0, 0, 4, 2, 1, 0, 1]]])
-        >>> zeros, ones = jnp.zeros((1, 2), int), jnp.ones((1, 2), bool)
-        >>> peaks = Peaks(jnp.zeros((1, 2, 2), int), boxes, ones, zeros, ones, jnp.array([2]))
-        >>> jax.jit(suppress)(peaks, 0.3).tolist()
-        [[True, False]]
-    """
-    boxes = boxes7_from_8(peaks.boxes) if normalize_yaw else peaks.boxes
-    classes = peaks.classes if per_class else None
-    return rotated_nms(boxes, peaks.is_valid, nms_iou, classes=classes)
 
 
 def find_peaks(
@@ -297,14 +257,11 @@ def rows_at(
 
 def _max_3x3(values: Float[jax.Array, "B R A C"]) -> Float[jax.Array, "B R A C"]:
     """Returns the maximum over each bin and its neighbors in range and azimuth."""
-    for axis in (1, 2):
-        size = values.shape[axis]
-        pad = [(0, 0)] * values.ndim
-        pad[axis] = (1, 1)
-        padded = jnp.pad(values, pad, constant_values=-jnp.inf)
-        shifts = [jax.lax.slice_in_dim(padded, i, i + size, axis=axis) for i in (0, 2)]
-        values = jnp.maximum(values, jnp.maximum(*shifts))
-    return values
+    r, a = values.shape[1:3]
+    border = ((0, 0), (1, 1), (1, 1), (0, 0))
+    padded = jnp.pad(values, border, constant_values=-jnp.inf)
+    shifted = [padded[:, i : i + r, j : j + a] for i, j in np.ndindex(3, 3)]
+    return functools.reduce(jnp.maximum, shifted)
 
 
 def _in_roi(

@@ -68,7 +68,9 @@ def embed_dataset(
     params = variables["params"][IMAGE_BACKBONE]
     fields = embedding_fields(model.options.image.to_dict())
     source = {"image": fields, "weights_sha256": weights_sha256(params)}
-    records = Records.create(folder, model.feature_shape, dtype, source, "float32")
+    records = Records.create(
+        folder, model.options.image.feature_shape, dtype, source, "float32"
+    )
     keys = records.keys()
     images = [f for f in frames if f.camera_path is not None and f.key not in keys]
     found = {f.key: f.camera_path for f in frames if f.key in keys}

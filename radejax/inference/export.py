@@ -306,7 +306,7 @@ def _exported(
     )
     if model.options.image.kind == "vit" and not with_backbone:
         variables["params"].pop(IMAGE_BACKBONE, None)
-        image = _array(batch, *model.feature_shape)
+        image = _array(batch, *model.options.image.feature_shape)
     return variables, (radar, image, vars(camera))
 
 

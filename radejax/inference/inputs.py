@@ -219,7 +219,7 @@ def _images(
         image = as_numbers(found, "image")
         image = image[None] if image.ndim == 3 else image
         has_image = np.ones(len(image), bool)
-    shapes = (*size, 3), model.feature_shape
+    shapes = (*size, 3), model.options.image.feature_shape
     if image.shape[1:] not in shapes:
         expected = " or embedded ones ".join(f"[B, {str(s)[1:-1]}]" for s in shapes)
         raise UserError(f"image has shape {list(image.shape)}, expected {expected}")

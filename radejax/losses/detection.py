@@ -15,13 +15,12 @@ from jaxtyping import Bool, Float, Int, Num, Shaped
 from radejax.core.errors import require
 from radejax.core.options import NotNegative, Options, Positive, find_function
 from radejax.core.structures import Batch, DetectionMaps
-from radejax.detection.decode import DecodeOptions, find_peaks, rows_at, suppress
-from radejax.detection.nms import match_boxes
+from radejax.detection.decode import DecodeOptions, find_peaks, rows_at
+from radejax.detection.nms import match_boxes, rotated_nms
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.focal import SigmaMode, focal_loss, gaussian_heatmap
 from radejax.losses.gwd import Transform, gwd_loss
 
-Assignment = Literal["center", "nms"]
 Scalar = Num[jax.Array, ""]
 Maps = Float[jax.Array, "B R A C"]
 Boxes8 = Float[jax.Array, "B N 8"]
@@ -47,7 +46,7 @@ class LossOptions(Options, section="config.loss"):
     """Normalize the predicted yaw vector before the Wasserstein distance. The authors' code
     does not. Smooth L1 always uses the raw vector, so that the network learns to predict
     unit length."""
-    assignment: Assignment = "center"
+    assignment: Literal["center", "nms"] = "center"
     """Boxes of the regression losses: center (predictions at the objects' own bins, as
     released) or nms (predictions that overlap an object after NMS, with the thresholds of
     decode, as in the paper)."""
@@ -337,7 +336,8 @@ def _after_nms(
         score_threshold=decoding.score_threshold,
         threshold_inclusive=decoding.threshold_inclusive,
     )
-    keep = suppress(peaks, decoding.nms_iou, per_class=decoding.per_class_nms)
+    classes = peaks.classes if decoding.per_class_nms else None
+    keep = rotated_nms(peaks.boxes, peaks.is_valid, decoding.nms_iou, classes=classes)
     match = jax.vmap(match_boxes)
     object_idx, is_matched = match(peaks.boxes, keep, boxes, is_valid)
     return peaks.bins, object_idx, is_matched

@@ -47,20 +47,16 @@ def options_class(name: str) -> type[RadeNetOptions]:
         UserError: There is no such model.
     """
     try:
-        kind: type[RadeNetOptions] = typing.get_type_hints(_model_class(name))[
-            "options"
-        ]
+        return typing.get_type_hints(_model_class(name))["options"]
     except NameError as error:
         raise UserError(
             f"config.model.name is {name!r}: {error}; import the types of its attributes "
             "outside of `if TYPE_CHECKING`"
         ) from None
-    return kind
 
 
 def _model_class(name: str) -> type[RadeNet]:
-    model: type[RadeNet] = find_part(name, "config.model.name", _MODELS, RadeNet)
-    return model
+    return find_part(name, "config.model.name", _MODELS, RadeNet)
 
 
 def has_camera(model: nn.Module) -> typing.TypeGuard[DinoRade]:

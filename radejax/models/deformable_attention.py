@@ -108,18 +108,14 @@ class DeformableAttention(Layer):
     def __call__(
         self,
         feature: Float[jax.Array, "B N C"],
-        scale: Float[jax.Array, "B N E"],
-        reference: Float[jax.Array, "#B N E 2"],
-        query_weights: Float[jax.Array, "#B N E"],
+        queries: Queries,
         value: Float[jax.Array, "B H W C"],
     ) -> Float[jax.Array, "B N C"]:
         """Computes the weighted sum of the attention of each bin's queries.
 
         Args:
             feature: `[B, N, C]` features of the bins.
-            scale: `[B, N, E]` factors; query e of bin n is `scale[n, e] * feature[n]`.
-            reference: `[B or 1, N, E, 2]` reference points, (x, y) in 0..1.
-            query_weights: `[B or 1, N, E]` weights of the queries in the sum.
+            queries: The E queries of the bins.
             value: `[B, H, W, C]` map to sample.
 
         Returns:
@@ -148,7 +144,7 @@ class DeformableAttention(Layer):
             value.reshape(*value.shape[:3], heads, -1),
             offsets.reshape(*batch, heads, points, 2),
             logits.reshape(*batch, heads, points),
-            Queries(scale, reference, query_weights),
+            queries,
             offset_bias.reshape(heads, points, 2),
             logit_bias.reshape(heads, points),
             chunk_size=self.chunk_size,
@@ -156,7 +152,7 @@ class DeformableAttention(Layer):
         # As the projection is linear, it is applied to the sum over the queries, with the
         # bias multiplied by the sum of their weights.
         out, bias = linear(name="output_proj")(out.reshape(*batch, -1))
-        total = query_weights.sum(-1, keepdims=True)  # 0 for bins without a query
+        total = queries.weights.sum(-1, keepdims=True)  # 0 for bins without a query
         return out + (total * jnp.expand_dims(bias, (0, 1))).astype(self.dtype)
 
     def _ring(self, _: jax.Array, shape: tuple[int, ...]) -> jax.Array:
@@ -215,11 +211,10 @@ def lifted_attention(
         def head(arrays: tuple[jax.Array, ...]) -> jax.Array:
             value, offsets, logits, *biases = arrays
             per_bin = (offsets, logits, *shared)
-            return _lifted_head(chunk_sizes, value, per_bin, tuple(biases))
+            return _lifted_head(chunk_sizes, (value, per_bin, tuple(biases)))
 
         by_head = (value, offsets, logits, offset_bias, logit_bias)
-        attention: jax.Array = jax.lax.map(head, by_head)
-        return attention
+        return jax.lax.map(head, by_head)
 
     arrays = (value, offsets, logits, *geometry)
     if b == 1:  # on a CPU, the gradient of a batch of one is slower
@@ -247,7 +242,7 @@ def _chunk_sizes(given: int, batch_size: object) -> ChunkSizes:
 
 
 def _by_chunk(
-    function: Callable[..., T], chunk_sizes: ChunkSizes, *arrays: jax.Array | Arrays
+    function: Callable[..., T], chunk_sizes: ChunkSizes, *arrays: HeadInputs | jax.Array
 ) -> T:
     """Calls `function(chunk_size, *arrays)` with the chunk size of the platform.
 
@@ -260,25 +255,22 @@ def _by_chunk(
     by_platform = {
         platform: functools.partial(function, size) for platform, size in chunk_sizes
     }
-    result: T = jax.lax.platform_dependent(*arrays, **by_platform)
-    return result
+    return jax.lax.platform_dependent(*arrays, **by_platform)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _lifted_head(
-    chunk_sizes: ChunkSizes, value: jax.Array, per_bin: Arrays, biases: Arrays
-) -> jax.Array:
+def _lifted_head(chunk_sizes: ChunkSizes, inputs: HeadInputs) -> jax.Array:
     """Computes the attention `[N, D]` of one head of one sample.
 
-    `value` is `[H, W, D]`, `per_bin` contains offsets, logits, scale, reference and
-    query weights, and `biases` the two biases, all as in `lifted_attention`.
+    The map is `[H, W, D]`. The values per bin are offsets, logits, scale, reference and
+    query weights, and the biases those of offsets and logits, all as in
+    `lifted_attention`.
     """
-    return _by_chunk(_head_forward, chunk_sizes, value, per_bin, biases)
+    return _by_chunk(_head_forward, chunk_sizes, inputs)
 
 
-def _head_forward(
-    chunk_size: int, value: jax.Array, per_bin: Arrays, biases: Arrays
-) -> jax.Array:
+def _head_forward(chunk_size: int, inputs: HeadInputs) -> jax.Array:
+    value, per_bin, biases = inputs
     pixels = value.reshape(-1, value.shape[-1])
 
     def chunk(parts: Arrays) -> jax.Array:
@@ -295,21 +287,19 @@ def _head_forward(
 
 
 def _lifted_head_forward(
-    chunk_sizes: ChunkSizes, value: jax.Array, per_bin: Arrays, biases: Arrays
+    chunk_sizes: ChunkSizes, inputs: HeadInputs
 ) -> tuple[jax.Array, HeadInputs]:
-    out = _lifted_head(chunk_sizes, value, per_bin, biases)
-    return out, (value, per_bin, biases)
+    return _lifted_head(chunk_sizes, inputs), inputs
 
 
 def _lifted_head_backward(
-    chunk_sizes: ChunkSizes, saved: HeadInputs, grad: jax.Array
-) -> HeadInputs:
-    return _by_chunk(_head_backward, chunk_sizes, grad, *saved)
+    chunk_sizes: ChunkSizes, inputs: HeadInputs, grad: jax.Array
+) -> tuple[HeadInputs]:
+    return (_by_chunk(_head_backward, chunk_sizes, inputs, grad),)
 
 
-def _head_backward(
-    chunk_size: int, grad: jax.Array, value: jax.Array, per_bin: Arrays, biases: Arrays
-) -> HeadInputs:
+def _head_backward(chunk_size: int, inputs: HeadInputs, grad: jax.Array) -> HeadInputs:
+    value, per_bin, biases = inputs
     pixels = value.reshape(-1, value.shape[-1])
     samples = functools.partial(_lifted_samples, value.shape[:2])
 
@@ -428,5 +418,4 @@ def _to_chunks(arrays: T, size: int) -> T:
         padded = jnp.pad(x, [(0, -bins % size)] + [(0, 0)] * (x.ndim - 1))
         return padded.reshape(-1, size, *x.shape[1:])
 
-    chunks: T = jax.tree.map(split, arrays)
-    return chunks
+    return jax.tree.map(split, arrays)

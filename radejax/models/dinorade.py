@@ -25,8 +25,6 @@ from radejax.models.vit import ViT
 IMAGE_BACKBONE = "image_backbone"
 """Key of the image backbone in the parameters, which published checkpoints must not contain."""
 
-_SCOPE = f"{IMAGE_BACKBONE}/"
-
 
 class DinoRade(RadeNet):
     """Radar-camera detector that fuses the features of a RADE-Net with those of an image.
@@ -39,20 +37,22 @@ class DinoRade(RadeNet):
     options: DinoRadeOptions
 
     def setup(self) -> None:
-        shared = self._shared()
-        dtype = shared["dtype"]
-        width = self.options.decoder_width
-        image = self.options.image
+        options = self.options
+        image = options.image
+        width = options.decoder_width
+        dtype = jnp.dtype(options.dtype)
+        remat = options.remat != "none"
         if image.kind == "vit":
-            remat = shared["remat"] and not image.freeze
             self.image_backbone: ResNetTrunk | ViT = ViT(
-                image, dtype=dtype, remat=remat
+                image, dtype=dtype, remat=remat and not image.freeze
             )
             self.image_neck: ResNetNeck | CameraNeck = CameraNeck(width, dtype=dtype)
         else:
             self.image_backbone = ResNetTrunk(image.resnet_width, dtype=dtype)
             self.image_neck = ResNetNeck(width, image.resnet_width, dtype=dtype)
-        self.image_fusion = Fusion(self.options.fusion, **shared)
+        self.image_fusion = Fusion(
+            options.fusion, num_groups=options.num_groups, dtype=dtype, remat=remat
+        )
 
     @nn.compact
     def __call__(
@@ -91,10 +91,7 @@ class DinoRade(RadeNet):
             reference = self._reference(camera, padded.shape)
             camera_map = self._camera_map(image, reference, train)
         elif image is not None or camera is not None:
-            raise UserError(
-                f"{'camera' if image is None else 'image'} is given without "
-                f"{'image' if image is None else 'camera'}: give both or none"
-            )
+            raise UserError("image and camera belong together: give both or none")
         x = self._features(padded)
         channels = padded.shape[-1] - self.options.elevation_bins
         elevation = padded[..., channels:]  # of the last frame
@@ -118,24 +115,19 @@ class DinoRade(RadeNet):
             raise UserError(
                 f"image is {tuple(image.shape)}, expected "
                 f"{('B', *options.size, 3)} (config.model.image.size) or, if embedded"
-                f" before, {('B', *self.feature_shape)}"
+                f" before, {('B', *options.feature_shape)}"
             )
         image = normalize(image, standardize=options.standardize)
         features = self.image_backbone(image)
         if options.kind == "vit":
             features = features[:, options.num_prefix :]
-            features = features.reshape(image.shape[0], *self.feature_shape)
+            features = features.reshape(image.shape[0], *options.feature_shape)
         return jax.lax.stop_gradient(features) if options.freeze else features
-
-    @property
-    def feature_shape(self) -> tuple[int, int, int]:
-        """Shape `(h, w, C)` of one image's features."""
-        return self.options.image.feature_shape
 
     @nn.nowrap
     def is_frozen(self, name: str) -> bool:
         """Returns whether a parameter, given as a path like "image_backbone/...", is frozen."""
-        return self.options.image.freeze and name.startswith(_SCOPE)
+        return self.options.image.freeze and name.startswith(f"{IMAGE_BACKBONE}/")
 
     def _reference(
         self, camera: Camera | ReferencePoints, shape: tuple[int, ...]
@@ -160,7 +152,7 @@ class DinoRade(RadeNet):
     def _camera_map(
         self, image: Real[jax.Array, "B _ _ _"], reference: ReferencePoints, train: bool
     ) -> Float[jax.Array, "B h w C"]:
-        is_embedded = tuple(image.shape[1:]) == self.feature_shape
+        is_embedded = tuple(image.shape[1:]) == self.options.image.feature_shape
         features = image if is_embedded else self.embed(image)
         has_image = reference.has_image
         if has_image is None:

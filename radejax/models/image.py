@@ -206,8 +206,7 @@ class ResNetLayer(Layer, kw_only=True):
     ) -> jax.Array:
         if self.frozen:
             return FrozenBatchNorm(dtype=self.dtype, name=name)(x)
-        y: jax.Array = batch_norm(name, self.dtype, train)(x, mask=mask)
-        return y
+        return batch_norm(name, self.dtype, train)(x, mask=mask)
 
 
 class Bottleneck(ResNetLayer):

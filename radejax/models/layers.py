@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
-from typing import TypedDict
 
 import flax.linen as nn
 import jax
@@ -40,8 +39,7 @@ def uniform_fan_in(fan_in: int) -> Initializer:
         size = math.prod(shape)
         count = max(2**14, 4 ** math.ceil(math.log(size, 4)))
         numbers = jax.random.uniform(key, (count,), jnp.float32, -bound, bound)
-        weights: jax.Array = _cut(numbers, shape)
-        return weights
+        return _cut(numbers, shape)
 
     return init
 
@@ -60,14 +58,6 @@ class Layer(nn.Module, kw_only=True):
     """
 
     dtype: DTypeLike = jnp.float32
-
-
-class PartFields(TypedDict):
-    """The fields of a `Part`, by name."""
-
-    num_groups: int
-    dtype: DTypeLike
-    remat: bool
 
 
 class Part(Layer, kw_only=True):
@@ -109,8 +99,6 @@ class Conv(Layer):
         x = jnp.asarray(x, self.dtype)
         if self.stride == 1:
             y = conv2d(x, kernel, self.dilation)
-        elif self.size == 1:
-            y = conv2d(x[:, :: self.stride, :: self.stride], kernel)
         else:
             y = plain_conv2d(x, kernel, stride=self.stride)
         if self.use_bias:

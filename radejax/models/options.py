@@ -256,14 +256,11 @@ class QueryGridOptions(Options, section="config.model.query_grid"):
 
         A grid with fewer than two elevations gets those of K-Radar, -18 to 18 degrees.
         """
-        range_m = grid.range_m
-        if is_uniform(range_m):
-            range_m = np.array([range_m[0], grid.range_step_m])
         elevation = grid.elevation_rad
         if elevation.size < 2:
             elevation = RadarGrid.kradar().elevation_rad
         return cls(
-            range_m=range_m.tolist(),
+            range_m=_first_and_step(grid.range_m, grid.range_step_m).tolist(),
             azimuth_deg=azimuth_axis_deg(grid),
             elevation_deg=np.rad2deg(elevation[[0, -1]]).tolist(),
         )
@@ -300,8 +297,7 @@ class QueryGridOptions(Options, section="config.model.query_grid"):
         axes = np.broadcast_arrays(x, y, np.sin(elevation))
         dtype = np.float64 if xp is np else np.float32
         unit = xp.asarray(np.stack(axes, -1)[None], dtype)
-        centers: Array = xp.asarray(range_m.reshape(-1, 1, 1, 1), dtype) * unit
-        return centers
+        return xp.asarray(range_m.reshape(-1, 1, 1, 1), dtype) * unit
 
 
 def azimuth_axis_deg(grid: RadarGrid) -> tuple[float, ...]:
@@ -312,10 +308,13 @@ def azimuth_axis_deg(grid: RadarGrid) -> tuple[float, ...]:
         >>> [round(value, 6) for value in azimuth_axis_deg(RadarGrid.kradar())]
         [-53.0, 1.0]
     """
-    azimuth = grid.azimuth_rad
-    if is_uniform(azimuth):
-        azimuth = np.array([azimuth[0], grid.azimuth_step_rad])
+    azimuth = _first_and_step(grid.azimuth_rad, grid.azimuth_step_rad)
     return tuple(np.rad2deg(azimuth).tolist())
+
+
+def _first_and_step(axis: Float[np.ndarray, " bins"], step: float) -> np.ndarray:
+    """Returns the first center of an axis and its step, or all centers of an uneven axis."""
+    return np.array([axis[0], step]) if is_uniform(axis) else axis
 
 
 def axis_centers(axis: tuple[float, ...], count: int) -> Float[np.ndarray, " {count}"]:

@@ -6,6 +6,8 @@ References:
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from typing import TypeVar
 
 import flax.linen as nn
@@ -19,7 +21,7 @@ from radejax.core.options import find_part
 from radejax.core.structures import DetectionMaps
 from radejax.models.backbone import BACKBONES
 from radejax.models.heads import NECKS, Heads
-from radejax.models.layers import Map, Part, PartFields
+from radejax.models.layers import Map, Part
 from radejax.models.options import RadeNetOptions, axis_centers
 
 Projection = Float[jax.Array, "B R A DE"]
@@ -83,32 +85,29 @@ class RadeNet(nn.Module):
         """Applies the backbone."""
         options = self.options
         backbone = find_part(options.backbone, "config.model.backbone", BACKBONES)
-        features: Map = self._stage(backbone)(
+        return self._part(backbone)(
             doppler_bins=self.num_frames * options.doppler_bins,
             widths=options.widths,
             decoder_width=options.decoder_width,
             cbam=options.cbam,
             input_stem=options.input_stem,
-            **self._shared(),
             name="backbone",
         )(padded)
-        return features
 
     def _maps(
         self, features: Float[jax.Array, "B Rp Ap C"], projection: Projection
     ) -> DetectionMaps:
         """Applies neck and heads, and crops the maps if `crop_output`."""
         options = self.options
-        neck = self._stage(find_part(options.neck, "config.model.neck", NECKS))
-        heads = self._stage(Heads)(
+        neck = self._part(find_part(options.neck, "config.model.neck", NECKS))
+        heads = self._part(Heads)(
             num_classes=options.num_classes,
             kind=options.heads,
             heatmap_prior=options.heatmap_prior,
             outputs=options.outputs,
-            **self._shared(),
             name="heads",
         )
-        maps: DetectionMaps = heads(neck(**self._shared(), name="neck")(features))
+        maps = heads(neck(name="neck")(features))
         if options.beam_azimuth_deg is not None:
             azimuth_deg = axis_centers(options.beam_azimuth_deg, features.shape[2])
             params = vehicle_from_beam(maps.box_params, np.deg2rad(azimuth_deg))
@@ -118,15 +117,15 @@ class RadeNet(nn.Module):
             maps = jax.tree.map(lambda m: m[:, :r, :a], maps)
         return maps
 
-    def _stage(self, part: type[PartT]) -> type[PartT]:
-        return nn.remat(part) if self.options.remat == "full" else part
-
-    def _shared(self) -> PartFields:
-        return {
-            "num_groups": self.options.num_groups,
-            "dtype": jnp.dtype(self.options.dtype),
-            "remat": self.options.remat != "none",
-        }
+    def _part(self, kind: type[PartT]) -> Callable[..., PartT]:
+        """Returns the constructor of a part with the fields that all parts share."""
+        options = self.options
+        return functools.partial(
+            nn.remat(kind) if options.remat == "full" else kind,
+            num_groups=options.num_groups,
+            dtype=jnp.dtype(options.dtype),
+            remat=options.remat != "none",
+        )
 
 
 def vehicle_from_beam(

@@ -76,8 +76,7 @@ class ViT(Layer):
             length=options.num_layers,
         )
         tokens, _ = layers(options, self.dtype, name="layers")(tokens, rope)
-        normalized: Tokens = _layer_norm(rope, jnp.float32, "norm")(tokens)
-        return normalized
+        return _layer_norm(rope, jnp.float32, "norm")(tokens)
 
     def _embed(
         self, image: Float[jax.Array, "B H W 3"], rows: int, columns: int
@@ -190,27 +189,25 @@ def bicubic_weights(
         weights = weights[:, 2:-2] / weights[:, 2:-2].sum(1, keepdims=True)
     else:
         weights = weights @ np.eye(old)[samples.clip(0, old - 1)]
-    rounded: np.ndarray = weights.astype(np.float32)
-    return rounded
+    return weights.astype(np.float32)
 
 
-def rotary_angles(rows: int, columns: int, head_dim: int, theta: float = 100.0) -> Rope:
+def rotary_angles(rows: int, columns: int, head_dim: int) -> Rope:
     """Computes the rotary position embedding of a grid of patches.
 
     The coordinates p of patch centers are in [-1, 1] along each axis. The first quarter of
     a head's channels encodes the row, the second quarter the column, and the second half
-    repeats both. Channel i of a quarter has the angle `2 pi p / theta^(4 i / head_dim)`.
+    repeats both. Channel i of a quarter has the angle `2 pi p / 100^(4 i / head_dim)`.
 
     Args:
         rows: Number of patches along the height.
         columns: Number of patches along the width.
         head_dim: Channels of a head, a multiple of 4.
-        theta: Base of the wavelengths.
 
     Returns:
         Cosines and sines of the angles, two float32 arrays `[rows * columns, head_dim]`.
     """
-    frequency = theta ** -(np.arange(head_dim // 4) * 4.0 / head_dim)
+    frequency = 100.0 ** -(np.arange(head_dim // 4) * 4.0 / head_dim)
 
     def axis_angles(count: int) -> np.ndarray:
         position = 2.0 * (np.arange(count) + 0.5) / count - 1.0
@@ -267,10 +264,9 @@ def attend(
         if is_half and jax.default_backend() == "gpu":  # tracing "cudnn" needs a GPU
             flash["cuda"] = functools.partial(plain, implementation="cudnn")
         # The choice is made at lowering, so that a traced program runs on each platform.
-        out: PerHead = jax.lax.platform_dependent(
+        return jax.lax.platform_dependent(
             query, key, value, cpu=_attend_blocked, default=plain, **flash
         )
-        return out
     if kind == "blocked":
         return _attend_blocked(query, key, value)
     return plain(query, key, value, implementation=kind)
@@ -298,8 +294,7 @@ def _attend_blocked(query: OfSample, key: OfSample, value: OfSample) -> OfSample
             total = weights.sum(0, keepdims=True)
             return ((values @ weights.astype(x.dtype)) / total).astype(x.dtype)
 
-        attended: jax.Array = jax.lax.map(one_block, blocks)
-        return attended
+        return jax.lax.map(one_block, blocks)
 
     # [heads, n, d, block]
     out: jax.Array = jax.lax.map(one_head, (queries, keys, values))

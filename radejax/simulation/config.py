@@ -237,10 +237,6 @@ class SimulationOptions(Options, section="config.simulation"):
         require(is_uniform(doppler), name, doppler.tolist(), "uniform bins of an FFT")
         return grid
 
-    def make_parameters(self) -> RadarParameters:
-        """Returns the parameters of the radar other than its axes."""
-        return self.radar.make_parameters()
-
     def to_json(self) -> str:
         """Returns canonical JSON text, which is equal for equal options."""
         values = self.model_dump(exclude_none=True) | {"sequences": self.sequences}

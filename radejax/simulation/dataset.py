@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import collections
 import contextlib
+import dataclasses
 import functools
 import hashlib
 import itertools
@@ -173,15 +174,13 @@ def _marker(options: SimulationOptions) -> files.JsonObject:
     return content
 
 
+@dataclasses.dataclass
 class Writer:
     """Writes the files of a dataset; worker processes have a copy that prepares frames."""
 
-    def __init__(
-        self, root: pathlib.Path, options: SimulationOptions, source: SceneSource
-    ) -> None:
-        self.root = root
-        self.options = options
-        self.source = source
+    root: pathlib.Path
+    options: SimulationOptions
+    source: SceneSource
 
     def write_common(self) -> list[FrameSpec]:
         """Writes everything but frames, and returns the frames without a label file."""
@@ -240,7 +239,7 @@ class Writer:
         compute = functools.partial(
             tensor.simulate,
             grid=self.options.make_grid(),
-            parameters=self.options.make_parameters(),
+            parameters=self.options.radar.make_parameters(),
             output=self.options.output,
         )
         with contextlib.closing(self._prepared(num_workers, missing)) as frames:
@@ -328,9 +327,8 @@ _writer: Writer
 
 
 def _start_worker(writer: Writer) -> None:
-    """Sets up a worker process, which uses the CPU as the parent uses the accelerator."""
+    """Sets up a worker process."""
     global _writer
-    jax.config.update("jax_platforms", "cpu")
     _writer = writer
 
 

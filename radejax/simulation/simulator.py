@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, UInt32
 from radejax.core.errors import UserError, require
 from radejax.data.kradar import Frame, KRadar
 from radejax.data.kradar.folders import split_by_rule
-from radejax.data.kradar.labels import Label, LabelHeader
+from radejax.data.kradar.labels import Label
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.radar import propagation, scattering, sensor, tensor
 from radejax.simulation.world import own_scenes, scene
@@ -71,7 +71,7 @@ class SequenceSimulator:
         self.sequence = sequence
         self.options = options
         self.grid = options.make_grid()
-        self.parameters = options.make_parameters()
+        self.parameters = options.radar.make_parameters()
         rng = np.random.default_rng([options.seed, sequence.name, 11])
         tracks = sequence.tracks
         sizes_m = np.median(tracks.size_m, axis=0)
@@ -136,10 +136,8 @@ class SequenceSimulator:
         These are in the field of view, have an SNR above `MIN_SNR_DB`, and more than
         `MIN_LIT` of their power is not blocked by other boxes.
         """
-        visible: np.ndarray = self.grid.in_field_of_view(*frame.boxes[:, :2].T)
-        visible &= given.snr_db > MIN_SNR_DB
-        visible &= given.lit > MIN_LIT
-        return visible
+        in_view = self.grid.in_field_of_view(*frame.boxes[:, :2].T)
+        return in_view & (given.snr_db > MIN_SNR_DB) & (given.lit > MIN_LIT)
 
     def labels(self, frame: SceneFrame, given: RadarInput) -> list[Label]:
         """Returns the labels of one frame in the LiDAR frame, as in K-Radar's files."""
@@ -278,7 +276,10 @@ class LabelSource:
         specs = []
         for index in chosen:
             header = frames[index].header
-            indices = _header_indices(header)
+            # Sensors that are missing in old labels get the frame number of the LiDAR.
+            maybe = header.camera_front, header.lidar_long, header.camera_lrr
+            others = (header.lidar if n is None else n for n in maybe)
+            indices = (header.radar, header.lidar, *others)
             split = "train" if names[index] in train else "test"
             specs.append(FrameSpec(number, index, indices, header.timestamp_s, split))
         return specs
@@ -288,16 +289,6 @@ class LabelSource:
         rng = np.random.default_rng([self._options.seed, number])
         shift_m = self._options.radar_from_lidar_m
         return make_real_sequence(self._frames[number], shift_m, rng)
-
-
-def _header_indices(header: LabelHeader) -> tuple[int, ...]:
-    """Returns the frame numbers of a `FrameSpec`.
-
-    Sensors that are missing in old labels get the frame number of the LiDAR.
-    """
-    maybe = header.camera_front, header.lidar_long, header.camera_lrr
-    camera, long_lidar, others = (header.lidar if n is None else n for n in maybe)
-    return header.radar, header.lidar, camera, long_lidar, others
 
 
 SceneSource = ProceduralSource | LabelSource

@@ -119,8 +119,7 @@ def from_torch(
     if problems:
         shown = "; ".join(problem[:160] for problem in sorted(problems)[:_SHOWN])
         raise DataError(f"{source} does not fit, {len(problems)} problems: {shown}")
-    variables: MutableVariableDict = unflatten_dict(flat, sep="/")
-    return variables
+    return unflatten_dict(flat, sep="/")
 
 
 def to_torch(rules: Rules, variables: VariableDict) -> dict[str, np.ndarray]:

@@ -96,19 +96,10 @@ def _rebuild_tensor(
     return np.lib.stride_tricks.as_strided(values[offset:], shape, steps)
 
 
-def _rebuild_parameter(data: np.ndarray, *unused: object) -> np.ndarray:
-    return data
-
-
-def _new_dict() -> dict[str | int, object]:
-    """Returns a dict for an `OrderedDict`, which later instructions fill."""
-    return {}
-
-
 _ALLOWED: dict[tuple[str, str], object] = {
     ("torch._utils", "_rebuild_tensor_v2"): _rebuild_tensor,
-    ("torch._utils", "_rebuild_parameter"): _rebuild_parameter,
-    ("collections", "OrderedDict"): _new_dict,
+    ("torch._utils", "_rebuild_parameter"): lambda data, *unused: data,
+    ("collections", "OrderedDict"): lambda: {},  # which later instructions fill
 } | {("torch", name): dtype for name, dtype in _DTYPES.items()}
 
 _OPCODES = (

@@ -107,8 +107,9 @@ def test_reference_module_and_gradients(case_of, name, make):
 def test_initial_offsets_form_rings(released):
     expected = released("deform_attn")["initial_bias__d128_l1_h4_p8"]
     module = DeformableAttention(128, 4, 8)
-    shapes = (1, 1, 128), (1, 1, 1), (1, 1, 1, 2), (1, 1, 1), (1, 2, 2, 128)
-    params = jax.jit(module.init)(jax.random.key(0), *map(jnp.zeros, shapes))["params"]
+    queries = Queries(*map(jnp.zeros, [(1, 1, 1), (1, 1, 1, 2), (1, 1, 1)]))
+    inputs = jnp.zeros((1, 1, 128)), queries, jnp.zeros((1, 2, 2, 128))
+    params = jax.jit(module.init)(jax.random.key(0), *inputs)["params"]
     np.testing.assert_allclose(params["sampling_offsets"]["bias"], expected, atol=1e-5)
     for name in ("sampling_offsets", "attention_weights"):
         assert not params[name]["kernel"].any()
@@ -126,12 +127,14 @@ def lifted_case(shared_geometry, seed=0):
     batch = 1 if shared_geometry else B
     inputs = {
         "feature": rng.standard_normal((B, N, C)),
-        "scale": rng.random((B, N, E)) * (rng.random((B, N, E)) > 0.3),
-        "reference": rng.uniform(-0.1, 1.1, (batch, N, E, 2)),
-        "query_weights": rng.random((batch, N, E)) * (rng.random((batch, N, E)) > 0.2),
+        "queries": Queries(
+            rng.random((B, N, E)) * (rng.random((B, N, E)) > 0.3),
+            rng.uniform(-0.1, 1.1, (batch, N, E, 2)),
+            rng.random((batch, N, E)) * (rng.random((batch, N, E)) > 0.2),
+        ),
         "value": rng.standard_normal((B, H, W, C)),
     }
-    inputs = {k: jnp.asarray(v) for k, v in inputs.items()}
+    inputs = jax.tree.map(jnp.asarray, inputs)
     return module, random_params(rng, module), inputs, rng.standard_normal((B, N, C))
 
 
@@ -151,8 +154,9 @@ def random_params(rng, module):
 
 
 def through_plain_form(module, params, inputs):
-    query = inputs["scale"][..., None] * inputs["feature"][:, :, None]
-    points = jnp.broadcast_to(inputs["reference"], (B, N, E, 2))
+    queries = inputs["queries"]
+    query = queries.scale[..., None] * inputs["feature"][:, :, None]
+    points = jnp.broadcast_to(queries.reference, (B, N, E, 2))
     out, *_ = plain_attention(
         params["params"],
         query.reshape(B, N * E, C),
@@ -161,7 +165,7 @@ def through_plain_form(module, params, inputs):
         [(H, W)],
         (module.num_heads, module.num_points),
     )
-    weights = inputs["query_weights"][..., None]
+    weights = queries.weights[..., None]
     return (out.reshape(B, N, E, C) * weights).sum(2)
 
 

@@ -111,7 +111,7 @@ def test_what_is_computed_before_gives_the_same_prediction():
     params = dict(variables["params"])
     backbone = {"params": {"image_backbone": params.pop("image_backbone")}}
     features = jax.jit(functools.partial(model.apply, method="embed"))(backbone, image)
-    chex.assert_shape(features, (B, *model.feature_shape))
+    chex.assert_shape(features, (B, *model.options.image.feature_shape))
     found = applied()(variables | {"params": params}, projection, features, camera)
     chex.assert_trees_all_close(found, expected, atol=2e-6)
 
@@ -173,8 +173,8 @@ def test_images_of_another_size_are_rejected():
     short = references(model, calibration().camera(), 4)
     for message, arguments in (
         (r"\(2, 32, 32, 3\), expected \('B', 32, 48", (image[:, :, :32], camera)),
-        ("camera is given without image", (None, camera)),
-        ("image is given without camera", (image,)),
+        ("image and camera belong together", (None, camera)),
+        ("image and camera belong together", (image,)),
         (r"reference points are \(1, 4, 8, 3\), expected", (image, short)),
     ):
         with pytest.raises(UserError, match=message):

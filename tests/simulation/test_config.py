@@ -85,13 +85,16 @@ def test_wrong_values(change, message):
 
 def test_every_field_of_the_radar_has_limits_that_its_default_keeps():
     options = SimulationOptions(radar=RadarParameters().to_dict())
-    assert options.make_parameters() == RadarParameters()
+    assert options.radar.make_parameters() == RadarParameters()
 
 
 def test_a_sensor_is_changed_or_replaced():
     options = SimulationOptions()
     changed = options.replace(radar={"preset": "ideal"})
-    assert changed.make_parameters().azimuth_elements == 40.0
+    assert changed.radar.make_parameters().azimuth_elements == 40.0
     full = changed.replace(**FULL_SIZE)
     assert full.radar == RadarOptions() != options.radar
-    assert full.make_parameters().azimuth_elements == RadarParameters().azimuth_elements
+    assert (
+        full.radar.make_parameters().azimuth_elements
+        == RadarParameters().azimuth_elements
+    )

@@ -56,7 +56,7 @@ def test_weights_of_another_transformer_are_rejected(monkeypatch):
 def test_dinov2_small_has_the_sizes_of_its_config():
     model = build(load_config("dinorade:rcw_dinov2").model)
     # facebook/dinov2-small: 14 x 14 pixels per patch, pretrained at 518 x 518 pixels.
-    assert model.feature_shape == (51, 91, 384)
+    assert model.options.image.feature_shape == (51, 91, 384)
     shapes = jax.eval_shape(
         ViT(model.options.image).init,
         jax.random.key(0),

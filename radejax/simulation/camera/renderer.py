@@ -18,7 +18,7 @@ from radejax.core.structures import CLASSES
 from radejax.geometry.camera import CameraCalibration
 from radejax.simulation.camera import details, lens, shapes
 from radejax.simulation.config import SimulationOptions
-from radejax.simulation.world.scene import SceneFrame, Sequence, is_blocked, rotate
+from radejax.simulation.world.scene import SceneFrame, Sequence, is_blocked, turned
 
 # K-Radar's values for the pair (see the calibration files of the dataset).
 _front_camera = functools.partial(
@@ -215,12 +215,13 @@ class CameraRenderer:
         """Draws the visible headlights and rear lights of vehicles at night."""
         calibration = self.calibrations[side]
         vehicles = np.flatnonzero(np.isin(frame.cls, _WITH_LAMPS))
-        x, y, z, length, width, height, yaw = frame.boxes[np.repeat(vehicles, 2)].T
-        is_front = rotate(x, y, -yaw)[0] < 0  # the front faces the radar
+        boxes = frame.boxes[np.repeat(vehicles, 2)]
+        length, width, height, yaw = boxes[:, 3:].T
+        is_front = turned(boxes[:, :3], -yaw)[:, 0] < 0  # the front faces the radar
         along = np.where(is_front, 1.0, -1.0) * length / 2.0
         across = np.tile([-0.75, 0.75], len(vehicles)) * width / 2.0
-        dx, dy = rotate(along, across, yaw)
-        lamps = np.stack([x + dx, y + dy, z - 0.15 * height], 1)
+        inside = np.stack([along, across, -0.15 * height], 1)
+        lamps = boxes[:, :3] + turned(inside, yaw)
         origin = shapes.camera_position(calibration)
         obstacles = frame.boxes - np.r_[origin, np.zeros(4)]
         hidden = is_blocked(lamps - origin, obstacles, np.repeat(vehicles, 2))

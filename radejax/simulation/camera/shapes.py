@@ -144,8 +144,7 @@ class Light(NamedTuple):
             beam = np.exp(-np.square(y_m / (2.0 + 0.16 * np.abs(x_m))))
             brightness = brightness + 0.75 * beam * np.exp(-np.abs(x_m) / 28.0)
         clear = np.exp(-self.extinction_per_m * depth_m)[..., None]
-        lit: Colors = color * brightness[..., None] * clear + self.veil * (1.0 - clear)
-        return lit
+        return color * brightness[..., None] * clear + self.veil * (1.0 - clear)
 
 
 def visible_polygons(
@@ -179,8 +178,7 @@ def visible_polygons(
 def camera_position(calibration: CameraCalibration) -> Point:
     """Returns the position of the camera in the radar frame."""
     to_ego = calibration.rotation.T
-    origin: Point = calibration.radar_from_lidar_m - to_ego @ calibration.translation_m
-    return origin
+    return calibration.radar_from_lidar_m - to_ego @ calibration.translation_m
 
 
 def _object_faces(
@@ -249,23 +247,23 @@ def _project_faces(faces: Quads, calibration: CameraCalibration) -> list[list[fl
     for index, points in zip(whole, flat, strict=True):
         result[index] = points
     for index in np.flatnonzero(is_cut & (depth.max(1) >= _NEAR_M)):
-        cut = project(_cut_near(outlines[index], depth[index], _NEAR_M), camera)[0]
+        cut = project(_cut_near(outlines[index], depth[index]), camera)[0]
         if (cut.max(0) >= 0).all() and (cut.min(0) <= size).all():
             result[index] = np.clip(cut, *vicinity).ravel().tolist()
     return result
 
 
 def _cut_near(
-    outline: Float[np.ndarray, "P 3"], depth: Float[np.ndarray, " P"], near_m: float
+    outline: Float[np.ndarray, "P 3"], depth: Float[np.ndarray, " P"]
 ) -> Float[np.ndarray, "Q 3"]:
-    """Clips a polygon at a depth by the Sutherland-Hodgman algorithm."""
+    """Clips a polygon at the near plane by the Sutherland-Hodgman algorithm."""
     kept = []
     for i in range(len(outline)):
         here, there = depth[i - 1], depth[i]
-        if here >= near_m:
+        if here >= _NEAR_M:
             kept.append(outline[i - 1])
-        if (here >= near_m) != (there >= near_m):
-            part = (near_m - here) / (there - here)
+        if (here >= _NEAR_M) != (there >= _NEAR_M):
+            part = (_NEAR_M - here) / (there - here)
             kept.append(outline[i - 1] + part * (outline[i] - outline[i - 1]))
     return np.array(kept)
 

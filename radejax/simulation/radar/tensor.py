@@ -283,29 +283,27 @@ def simulate(
         float32 array, the tensor or its projections as selected by `output`.
     """
     pedestal = parameters.array_pedestal
-    elevation_rad = grid.elevation_rad if grid.num_elevation else np.zeros(1)
     m = parameters.elevation_elements
     n = parameters.azimuth_elements
-    elevation_basis = array_basis(elevation_rad, m, pedestal)
-    scan_rad = parameters.scan_beamwidth_rad
-    if scan_rad:  # every azimuth is measured alone, as by an element of its own
-        azimuth_basis = np.eye(grid.num_azimuth, dtype=np.float32)
-    else:
-        azimuth_basis = array_basis(grid.azimuth_rad, n, pedestal)
     up: Phases = None
     across: Phases = None
     of_range: Pedestal = 0.0
     if state is not None:
         up = state.elevation_phase_rad
         across = state.azimuth_phase_rad
-        azimuth_basis = azimuth_basis * state.beam_gain[:, None]
         of_range = state.range_pedestal
+    elevation_rad = grid.elevation_rad if grid.num_elevation else np.zeros(1)
+    elevation_basis = array_basis(elevation_rad, m, pedestal)
     elevation = array_signal(scatterers.elevation_rad, m, pedestal, up)  # [M, S]
-    azimuth = (
-        beam_response(scatterers.azimuth_rad, grid, scan_rad)
-        if scan_rad
-        else array_signal(scatterers.azimuth_rad, n, pedestal, across)
-    )  # [N, S]
+    scan_rad = parameters.scan_beamwidth_rad
+    if scan_rad:  # every azimuth is measured alone, as by an element of its own
+        azimuth_basis = np.eye(grid.num_azimuth, dtype=np.float32)
+        azimuth = beam_response(scatterers.azimuth_rad, grid, scan_rad)  # [A, S]
+    else:
+        azimuth_basis = array_basis(grid.azimuth_rad, n, pedestal)
+        azimuth = array_signal(scatterers.azimuth_rad, n, pedestal, across)  # [N, S]
+    if state is not None:
+        azimuth_basis = azimuth_basis * state.beam_gain[:, None]
     window = parameters.doppler_pedestal
     doppler = doppler_response(scatterers.velocity_mps, grid, window)  # [D, S]
     in_range = range_response(scatterers.range_m, grid, of_range)  # [R, S]
@@ -331,15 +329,13 @@ def simulate(
             return power
         maxima = jnp.concatenate([power.max(axis=0), power.max(axis=1)], axis=0).T
         levels = (10.0 * jnp.log10(maxima + POWER_FLOOR) + LOG_OFFSET_DB) / LOG_SCALE_DB
-        measured: jax.Array = grid.measured_channels(levels)  # [A, D+E]
-        return measured
+        return grid.measured_channels(levels)  # [A, D+E]
 
-    rows: Float[jax.Array, "..."] = lax.platform_dependent(
+    return lax.platform_dependent(
         (kept, in_range, noise_power, jnp.arange(grid.num_range, dtype=jnp.uint32)),
         cpu=functools.partial(lax.map, row),
         default=functools.partial(lax.map, row, batch_size=64),
     )
-    return rows
 
 
 def array_basis(

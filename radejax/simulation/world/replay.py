@@ -145,8 +145,7 @@ def infer_ego_speed(
     known = lower > 0.3 * usual  # slow vehicles ahead are weak evidence
     speed = np.where(known, lower, usual)
     speed = np.clip(speed, 0.0, np.maximum(np.minimum(upper, 40.0), 0.0))
-    smooth: Float[np.ndarray, " F"] = median_filter(speed, 21, mode="nearest")
-    return smooth
+    return median_filter(speed, 21, mode="nearest")
 
 
 def _ground_height(tracks: Tracks) -> float:

@@ -132,8 +132,7 @@ class SceneFrame:
         """Change of the boxes' x and y over time in the turning radar frame."""
         x_m, y_m = self.boxes[:, :2].T
         turning = self.ego_yaw_rate_radps * np.stack([-y_m, x_m], 1)
-        relative: np.ndarray = self.velocity_mps - self.ego_velocity_mps - turning
-        return relative
+        return self.velocity_mps - self.ego_velocity_mps - turning
 
 
 @dataclasses.dataclass(frozen=True)
@@ -183,7 +182,8 @@ class Sequence:
         centers = turned(tracks.position_m[index] - origin, -heading)
         is_near = np.hypot(centers[:, 0], centers[:, 1]) < max_distance_m
         chosen = np.flatnonzero(tracks.is_present[index] & is_near)
-        yaw = wrap_angle(tracks.yaw_rad[index] - heading)
+        turn = tracks.yaw_rad[index] - heading
+        yaw = (turn + np.pi) % (2.0 * np.pi) - np.pi  # in [-pi, pi)
         boxes = np.concatenate([centers, tracks.size_m[index], yaw[:, None]], 1)
         points = turned(fixed.position_m - origin, -heading)
         distance = np.hypot(points[:, 0], points[:, 1])
@@ -243,19 +243,7 @@ def is_blocked(
     leave = np.maximum(near, far).min(-1)
     crosses = (enter < leave) & (leave > 0) & (enter < 1.0) & (enter > 0)
     crosses &= np.arange(len(boxes))[None] != owner[:, None]
-    blocked: Bool[np.ndarray, " S"] = crosses.any(1)
-    return blocked
-
-
-def wrap_angle(angle_rad: Values) -> Values:
-    """Wraps angles to [-pi, pi)."""
-    return (angle_rad + np.pi) % (2.0 * np.pi) - np.pi
-
-
-def rotate(x: Values, y: Values, angle_rad: Broadcast) -> tuple[Values, Values]:
-    """Rotates vectors in the ground plane counter-clockwise."""
-    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
-    return cos * x - sin * y, sin * x + cos * y
+    return crosses.any(1)
 
 
 def turned(
@@ -263,4 +251,5 @@ def turned(
 ) -> Float[np.ndarray, "*all D"]:
     """Rotates vectors of two or three components counter-clockwise about the z axis."""
     x, y, *z = np.moveaxis(vectors, -1, 0)
-    return np.stack([*rotate(x, y, angle_rad), *z], -1)
+    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
+    return np.stack([cos * x - sin * y, sin * x + cos * y, *z], -1)

@@ -107,7 +107,7 @@ class _Traffic:
             speed = self.ego_speed * factor
             if stands:
                 speed = np.full_like(self.clock, 0.0 if lane == 0 else 23.0 + 2 * lane)
-            self._lane(lane * width, speed, 1.0, is_ego_lane=lane == 0)
+            self._lane(lane * width, speed, 1.0)
         border = (law.lanes_left + 0.5) * width + law.median_m
         mean = 23.0 if stands else max(float(self.ego_speed.mean()), 4.0)
         for lane in range(law.lanes_oncoming):
@@ -131,8 +131,7 @@ class _Traffic:
 
     def _size(self, cls: str) -> Size:
         mean, deviation = np.array(SIZES[cls])
-        size: Size = mean + deviation * self.rng.normal(size=3).clip(-2, 2)
-        return size
+        return mean + deviation * self.rng.normal(size=3).clip(-2, 2)
 
     def _vehicle_class(self) -> str:
         law = self.law
@@ -141,14 +140,11 @@ class _Traffic:
             return "Bus or Truck"
         return "Motorcycle" if draw < law.trucks + law.two_wheelers else "Sedan"
 
-    def _lane(
-        self,
-        left_m: float,
-        speed: PerFrame,
-        direction: float,
-        is_ego_lane: bool = False,
-    ) -> None:
-        """Adds the vehicles of one lane, with constant distances between them."""
+    def _lane(self, left_m: float, speed: PerFrame, direction: float) -> None:
+        """Adds the vehicles of one lane, with constant distances between them.
+
+        The lane at 0 is that of the ego vehicle, near which it is empty.
+        """
         rng = self.rng
         way = scene.traveled(speed) * direction
         relative = way - self.ego_along
@@ -159,7 +155,7 @@ class _Traffic:
             size = self._size(cls)
             rear = along
             along += size[0] / 2.0
-            if not (is_ego_lane and (-8.0 < rear < 7.0 or -8.0 < along < 7.0)):
+            if left_m != 0.0 or not (-8.0 < rear < 7.0 or -8.0 < along < 7.0):
                 sway = 0.15 * np.sin(self.clock * 0.7 + rng.uniform(0, 6.3))
                 shift = rng.normal() * 0.2
                 if cls == "Motorcycle":

@@ -57,7 +57,7 @@ class TestDraws:
 
     def test_an_ideal_sensor_has_no_state(self):
         config = SimulationOptions(radar={"preset": "ideal"})
-        assert config.make_parameters() == RadarParameters()
+        assert config.radar.make_parameters() == RadarParameters()
         assert state_of() is None
 
 
