@@ -110,21 +110,13 @@ def run(
         FileNotFoundError: A path does not exist.
     """
     folder = files.as_path(workdir).absolute()
-    _run(
-        config,
-        folder,
-        init_from=init_from,
-        init_partial=init_partial,
-        profile=profile,
-        mesh=mesh,
-    )
+    _run(config, folder, init_from, init_partial, profile, mesh)
     return folder
 
 
 def _run(
     config: Config,
     folder: pathlib.Path,
-    *,
     init_from: PathLike | None = None,
     init_partial: PathLike | None = None,
     profile: PathLike | None = None,
