@@ -194,13 +194,8 @@ def _run(
             training_data,
             folder,
             mesh,
-            initial=functools.partial(
-                initial_variables,
-                model,
-                config.seed,
-                variables=variables,
-                pretrained=pretrained,
-            ),
+            variables=variables,
+            pretrained=pretrained,
             validate=validate,
             profile=profile,
         )
@@ -270,7 +265,8 @@ def fit(
     workdir: pathlib.Path,
     mesh: Mesh,
     *,
-    initial: Callable[[Batch], VariableDict] | None = None,
+    variables: VariableDict | None = None,
+    pretrained: VariableDict | None = None,
     validate: Validate | None = None,
     profile: PathLike | None = None,
 ) -> tuple[TrainState, bool]:
@@ -283,8 +279,8 @@ def fit(
         data: Data to train on.
         workdir: Folder of checkpoints and logs.
         mesh: Devices to train on.
-        initial: Function from an empty batch to the variables of step 0, by
-            default `initial_variables` with the seed of the config.
+        variables: Variables of step 0, see `initial_variables`.
+        pretrained: Part of the variables of step 0, see `initial_variables`.
         validate: Function that is called every `evaluate_every_epochs` epochs and, unless
             this field is 0, after the last step, see `Evaluation.validate`.
         profile: Folder for a profiler trace of the steps `config.logging.profile_steps`,
@@ -301,14 +297,12 @@ def fit(
         UserError: The run would continue with other data, the warm-up is too long, or no
             space is left on the disk.
     """
-    if initial is None:
-        initial = functools.partial(initial_variables, model, config.seed)
     kept = config.train.checkpoints_to_keep
     with contextlib.ExitStack() as stack:
         checkpoints = Checkpoints(workdir / "checkpoints", max_to_keep=kept)
         stack.enter_context(checkpoints)
         state, step = _make_state_and_step(
-            config, model, data, mesh, checkpoints, initial
+            config, model, data, mesh, checkpoints, variables, pretrained
         )
         start = int(state.step)
         num_steps = count_steps(config.train, data.steps_per_epoch)
@@ -382,13 +376,19 @@ def _make_state_and_step(
     data: TrainingData,
     mesh: Mesh,
     checkpoints: Checkpoints,
-    initial: Callable[[Batch], VariableDict],
+    variables: VariableDict | None,
+    pretrained: VariableDict | None,
 ) -> tuple[TrainState, loop.PlacedStep]:
     """Restores or initializes the state, and returns it with the function of a step."""
     train = config.train
     use_ema = train.ema_decay is not None
     is_frozen = freezing(model, train.freeze)
     optimizer = make_optimizer(train, make_schedule(train, data.steps_per_epoch))
+
+    batch = loop.empty_batch(data.batches)
+
+    def initial() -> VariableDict:
+        return initial_variables(model, config.seed, batch, variables, pretrained)
 
     def create(variables: VariableDict) -> TrainState:
         check_patterns(variables["params"], train.freeze)
@@ -400,7 +400,7 @@ def _make_state_and_step(
     state = loop.restore_or_initialize(
         checkpoints,
         data.batches,
-        functools.partial(initial, loop.empty_batch(data.batches)),
+        initial,
         create,
         place,
         data.info.get("same", {}),
