@@ -326,8 +326,14 @@ def fit(
             int(state.num_skipped),
             int(state.num_skipped_in_row),
         )
-        external = models.external_parts(model)
-        save = hooks.Save(checkpoints, data.batches, data.info, check, external, start)
+
+        def save(
+            step: int, state: TrainState, _: Metrics, *, best: float | None = None
+        ) -> None:
+            check.finish()
+            kept = state.without(models.external_parts(model))
+            checkpoints.save(step, kept, data.batches, info=data.info, best=best)
+
         due = functools.partial(hooks.every, num_steps)
         called: list[Hook] = [timed_batches, bar, due(log_every_steps, log), check]
         if validate is not None:
@@ -363,7 +369,8 @@ def fit(
         )
         last = int(state.step)
         is_finished = last >= num_steps and not should_stop()
-        save(last, state, {})
+        if last > start:
+            save(last, state, {})
         checkpoints.wait()
         if is_finished:
             check.check_total(num_steps)

@@ -141,8 +141,9 @@ class Checkpoints:
         """Starts to save a checkpoint, and returns as soon as the arrays are copied.
 
         Args:
-            step: Step of the state, which names the checkpoint. It must be higher than
-                the steps of the existing checkpoints.
+            step: Step of the state, which names the checkpoint. It must not be below
+                the steps of the existing checkpoints; nothing is saved if there is one of
+                this step.
             state: Pytree of arrays.
             data_iterator: Grain iterator whose next batch belongs to `step`. All
                 processes share each batch and are at the same position.
@@ -152,6 +153,8 @@ class Checkpoints:
         Raises:
             DiskFullError: No space is left on the disk; earlier checkpoints stay intact.
         """
+        if step == self._manager.latest_step():
+            return
         description: JsonObject = {
             "info": dict(info),
             "position": data_iterator.get_state(),
