@@ -503,7 +503,7 @@ def _with_backbone(saved: SavedModel, given: PathLike | None) -> SavedModel:
         found = image_backbone.load_image_backbone(source, saved.model)
     elif start and files.as_path(start).exists() and not config.data.embeddings:
         source = start
-        found = _fitting_variables(start, config.model)
+        found = _fitting_variables(start, saved.model)
     if source is None:
         return saved
     backbone = found["params"].get(IMAGE_BACKBONE) if found else None
@@ -524,7 +524,7 @@ def _with_backbone(saved: SavedModel, given: PathLike | None) -> SavedModel:
 
 
 def starting_weights(
-    options: RadeNetOptions,
+    model: RadeNet,
     init_from: PathLike | None = None,
     image_backbone_path: PathLike | None = None,
     embeddings_sha256: str | None = None,
@@ -532,7 +532,7 @@ def starting_weights(
     """Reads the weights that a training starts from, including frozen ones.
 
     Args:
-        options: The section `config.model`.
+        model: Model that is trained.
         init_from: Path of a model that `load_model` accepts; None initializes all weights
             randomly, except those of the image backbone.
         image_backbone_path: Weights of the image backbone, see
@@ -550,13 +550,13 @@ def starting_weights(
     """
     variables = pretrained = None
     if init_from is not None:
-        variables = _fitting_variables(init_from, options)
+        variables = _fitting_variables(init_from, model)
     if variables is None or IMAGE_BACKBONE not in variables["params"]:
         pretrained = image_backbone.load_image_backbone(
-            image_backbone_path, models.build(options), embeddings_sha256
+            image_backbone_path, model, embeddings_sha256
         )
     digest = None
-    if isinstance(options, DinoRadeOptions) and options.image.freeze:
+    if models.has_camera(model) and model.options.image.freeze:
         digest = embeddings_sha256
         if digest is None:
             given = pretrained or variables
@@ -565,19 +565,21 @@ def starting_weights(
     return variables, pretrained, digest
 
 
-def _fitting_variables(path: PathLike, options: RadeNetOptions) -> VariableDict:
-    """Reads the weights of another run or an official file, which must fit `config.model`."""
-    wanted = options.to_dict()
+def _fitting_variables(path: PathLike, model: RadeNet) -> VariableDict:
+    """Reads the weights of another run or an official file, which must fit a model."""
+    wanted = model.options.to_dict()
     if files.as_path(path).is_dir():
         other = load_model(path)
         found = other.config.model.to_dict()
         if lines := files.differences(found, wanted, "config.model"):
             raise UserError(f"weights of {path} do not fit: {'; '.join(lines)}")
-        return other.variables
-    has_camera = isinstance(options, DinoRadeOptions)
-    structure = {} if has_camera else {n: x for n, x in wanted.items() if n != "name"}
-    variables = load_torch(path, **structure).variables
-    image_backbone.check_fits(models.build(options), variables, path)
+        variables = other.variables
+    elif models.has_camera(model):
+        variables = load_torch(path).variables
+    else:
+        del wanted["name"]
+        variables = load_torch(path, **wanted).variables
+    image_backbone.check_fits(model, variables, path)
     return variables
 
 

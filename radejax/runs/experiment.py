@@ -72,7 +72,6 @@ from radejax.training.step import (
     make_train_step,
     with_pretrained,
 )
-from radejax.weights.image_backbone import check_fits
 
 _log = logging.getLogger(__name__)
 
@@ -138,10 +137,8 @@ def _run(
     if config.data.embeddings is not None:
         digest = open_embeddings(config.data.embeddings).source["weights_sha256"]
     variables, pretrained, frozen_sha256 = starting_weights(
-        config.model, init_from, config.data.image_backbone, digest
+        model, init_from, config.data.image_backbone, digest
     )
-    if variables is not None:
-        check_fits(model, variables, str(init_from))
     if init_partial is not None:
         require(
             init_from is None, "--init-from", init_from, "none, or no --init-partial"
