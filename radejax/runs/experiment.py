@@ -167,7 +167,7 @@ def _run(
         if devices.is_main():
             files.write_json(folder / "run.json", info)
         training_data = TrainingData(
-            batches=data.training_batches(frames, config.train, config.seed),
+            batches=data.training_batches(),
             steps_per_epoch=len(frames) // config.train.batch_size,
             grid=models.map_grid(grid, model, config.data.azimuth_mapping),
             info=checkpoint_info(
