@@ -9,6 +9,7 @@ paths are completed, and all of them are made absolute.
 from __future__ import annotations
 
 import ast
+import functools
 import hashlib
 import importlib.util
 import logging
@@ -336,10 +337,7 @@ def with_texts(config: Config, texts: Mapping[str, str]) -> Config:
 def _read_text(config: Config, name: str, text: str) -> object:
     """Returns the first reading of a text that the type of a field allows."""
     *sections, field = name.split(".")
-    place: Any = config
-    for section in sections:
-        is_mapping = isinstance(place, Mapping)
-        place = place[section] if is_mapping else getattr(place, section)
+    place: Any = functools.reduce(getattr, sections, config)
     literal = _literal(text)
     info = getattr(type(place), "model_fields", {}).get(field)
     if info is None:  # a weight, or a parameter of the simulated radar
