@@ -270,7 +270,10 @@ class Checkpoints:
         handler = ocp.CompositeCheckpointHandler()
         try:
             if state is None:
-                state = self._saved_variables(step)
+                with ocp.PyTreeCheckpointer() as reader:
+                    metadata = reader.metadata(self.folder / str(step) / "state")
+                tree = metadata.item_metadata.tree
+                state = {name: tree[name] for name in _VARIABLES if name in tree}
                 numpy = ocp.RestoreArgs(restore_type=np.ndarray)
                 restore_args = jax.tree.map(lambda _: numpy, state)
             else:
@@ -314,13 +317,6 @@ class Checkpoints:
             f"checkpoint {step} in {self.folder} is corrupted ({reason}); there are "
             f"{self.steps()}"
         )
-
-    def _saved_variables(self, step: int) -> dict[str, PyTree]:
-        """Returns the metadata of the arrays in a checkpoint that are model variables."""
-        with ocp.PyTreeCheckpointer() as reader:
-            folder = self.folder / str(step) / "state"
-            saved = reader.metadata(folder).item_metadata.tree
-        return {name: saved[name] for name in _VARIABLES if name in saved}
 
     def _move_away(self, steps: list[int]) -> None:
         """Renames corrupted checkpoints, so that these steps can be saved again."""
