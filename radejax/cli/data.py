@@ -148,8 +148,8 @@ def check(
 
     how = {"deep": deep, "progress": not as_json}
     if config is None:
-        options["version"] = options["version"] or DataOptions().label_version
-        report = kradar_check.check_dataset(roots, **how, **options)
+        version = options.pop("label_version") or DataOptions().label_version
+        report = kradar_check.check_dataset(roots, version=version, **how, **options)
     else:
         frames = entry.read_frames(roots, config, **options)
         classes = radejax.load_config(config).classes
