@@ -27,13 +27,7 @@ from annotated_types import MinLen
 from radejax import models
 from radejax.core.errors import UserError, require
 from radejax.core.files import JsonObject, as_path
-from radejax.core.options import (
-    Options,
-    Seed,
-    as_tuples,
-    did_you_mean,
-    find_function,
-)
+from radejax.core.options import Options, Seed, as_tuples, did_you_mean, find_function
 from radejax.core.structures import CLASSES
 from radejax.data.dataset import find_reader
 from radejax.data.options import DATA_PATHS, DataOptions
@@ -42,11 +36,7 @@ from radejax.evaluation.evaluation_set import SPACES
 from radejax.evaluation.results import EvaluationOptions
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.detection import LossOptions
-from radejax.models.options import (
-    RadeNetOptions,
-    axis_centers,
-    azimuth_axis_deg,
-)
+from radejax.models.options import RadeNetOptions, axis_centers, azimuth_axis_deg
 from radejax.simulation.config import SimulationOptions
 from radejax.training.options import LoggingOptions, TrainOptions
 

@@ -48,11 +48,7 @@ from radejax.data.dataset import FrameSequence
 from radejax.data.records import open_embeddings
 from radejax.evaluation.report import Report, Table, number, numbers, write_tables
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.inference.saved import (
-    FROZEN_BACKBONE,
-    matching_weights,
-    starting_weights,
-)
+from radejax.inference.saved import FROZEN_BACKBONE, matching_weights, starting_weights
 from radejax.runs.data import located, open_data
 from radejax.runs.evaluate import Evaluation, named_aps
 from radejax.training import hooks, loop
