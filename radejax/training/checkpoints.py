@@ -49,20 +49,17 @@ def _without_orbax_log() -> Iterator[None]:
 
     The root logger is not configured either.
     """
+
+    def is_of_others(record: logging.LogRecord) -> bool:
+        return "orbax" not in record.pathname
+
     log = absl_logging.get_absl_logger()
-    if _is_not_of_orbax in log.filters:  # within another block
-        yield
-        return
-    log.addFilter(_is_not_of_orbax)
+    log.addFilter(is_of_others)
     try:
         with keep_root_logger():
             yield
     finally:
-        log.removeFilter(_is_not_of_orbax)
-
-
-def _is_not_of_orbax(record: logging.LogRecord) -> bool:
-    return "orbax" not in record.pathname
+        log.removeFilter(is_of_others)
 
 
 class Checkpoints:
