@@ -332,13 +332,13 @@ def _read_checkpoint(path: pathlib.Path, step: Step) -> SavedModel:
         )
     # Orbax takes a second to import, and the other kinds of models do not need it.
     from radejax.training.checkpoints import Checkpoints
-    from radejax.training.step import merge_parameters
+    from radejax.training.step import merge_variables
 
     with Checkpoints(folder, read_only=True) as checkpoints:
         chosen = checkpoints.best_step() if step == "best" else step
         state, info, number = checkpoints.restore_variables(chosen)
     trained = state["ema_params"] if state.get("ema_params") else state["params"]
-    params = merge_parameters(trained, state.get("frozen") or {})
+    params = merge_variables(trained, state.get("frozen") or {})
     try:
         config = Config(**info["config"])
     except UserError as error:

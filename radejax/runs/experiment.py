@@ -66,7 +66,7 @@ from radejax.training.step import (
     make_optimizer,
     make_schedule,
     make_train_step,
-    with_pretrained,
+    merge_variables,
 )
 
 _log = logging.getLogger(__name__)
@@ -140,7 +140,7 @@ def _run(
             init_from is None, "--init-from", init_from, "none, or no --init-partial"
         )
         part = matching_weights(init_partial, model)
-        pretrained = with_pretrained(part, pretrained or {})
+        pretrained = merge_variables(part, pretrained or {})
 
     with claimed(folder, config):
         info = run_info(folder, init_from, init_partial)

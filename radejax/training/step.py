@@ -198,7 +198,7 @@ class TrainState(struct.PyTreeNode):
     def eval_variables(self) -> VariableDict:
         """Variables for evaluation, with the averaged parameters if there are any."""
         params = self.params if self.ema_params is None else self.ema_params
-        return {"params": merge_parameters(params, self.frozen), **self.model_state}
+        return {"params": merge_variables(params, self.frozen), **self.model_state}
 
     def without(self, parts: Iterable[str]) -> TrainState:
         """Returns the state without the frozen parameters of parts of the model."""
@@ -285,21 +285,14 @@ def split_parameters(
     return unflatten_dict(trained, sep="/"), unflatten_dict(frozen, sep="/")
 
 
-def merge_parameters(params: Collection, frozen: Collection) -> Collection:
-    """Merges trained and frozen parameters; the inverse of `split_parameters`."""
-    flat = {**flatten_dict(params, sep="/"), **flatten_dict(frozen, sep="/")}
-    merged: Collection = unflatten_dict(flat, sep="/")
-    return merged
-
-
-def with_pretrained(variables: VariableDict, part: VariableDict) -> VariableDict:
-    """Returns variables with a part replaced, such as a pretrained image backbone.
+def merge_variables(variables: VariableDict, part: VariableDict) -> VariableDict:
+    """Returns variables with a part added or replaced; the inverse of `split_parameters`.
 
     Args:
-        variables: Variables of a model: "params" and other collections.
-        part: Tree of the variables to replace, such as
+        variables: Tree of the variables or parameters of a model.
+        part: Tree of those to replace, such as a pretrained image backbone,
             `{"params": {"image_backbone": params}}`. Entries that `variables` lack are
-            added.
+            added, such as frozen parameters.
 
     Raises:
         UserError: The shapes of a variable differ.
@@ -339,7 +332,7 @@ def initial_variables(
     if variables is None:
         init_key, _ = run_keys(seed)
         variables = model.init(init_key, *batch.model_inputs(), train=False)
-    return variables if pretrained is None else with_pretrained(variables, pretrained)
+    return variables if pretrained is None else merge_variables(variables, pretrained)
 
 
 # Step --------------------------------------------------------------------------------
@@ -376,7 +369,7 @@ def make_train_step(
         params: Collection, state: TrainState, batch: Batch, rng: jax.Array
     ) -> tuple[Float[jax.Array, ""], tuple[VariableDict, Metrics]]:
         maps, model_state = model.apply(
-            {"params": merge_parameters(params, state.frozen), **state.model_state},
+            {"params": merge_variables(params, state.frozen), **state.model_state},
             *batch.model_inputs(),
             train=True,
             rngs={"dropout": rng},

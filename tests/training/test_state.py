@@ -17,9 +17,8 @@ from radejax.training.step import (
     freezing,
     make_optimizer,
     make_schedule,
-    merge_parameters,
+    merge_variables,
     split_parameters,
-    with_pretrained,
 )
 
 
@@ -155,7 +154,7 @@ def test_patterns_are_of_parameters_or_of_whole_parts():
     ):
         parts = split_parameters(params, freezing(WithFrozenPart(), patterns))
         assert parts[1] == frozen
-        assert merge_parameters(*parts) == params
+        assert merge_variables(*parts) == params
 
 
 PARAMS = {"backbone": {"w": 1}, "image": {"w": 3}}
@@ -196,10 +195,10 @@ def test_pretrained_parts_replace_their_like():
     proj = {"kernel": np.ones((3, 8)), "bias": np.zeros(8)}
     variables = {"params": {"image_neck": {"proj": proj}, "heads": {}}}
     part = {"params": {"image_neck": {"proj": {"bias": np.full(8, 7.0)}, "new": 1}}}
-    merged = with_pretrained(variables, part)
+    merged = merge_variables(variables, part)
     assert (merged["params"]["image_neck"]["proj"]["bias"] == 7).all()
     assert merged["params"]["image_neck"]["proj"]["kernel"] is proj["kernel"]
     assert merged["params"]["image_neck"]["new"] == 1
     wrong = {"params": {"image_neck": {"proj": {"bias": np.zeros(9)}}}}
     with pytest.raises(UserError, match=r"params/image_neck/proj/bias is \(9,\)"):
-        with_pretrained(variables, wrong)
+        merge_variables(variables, wrong)
