@@ -58,10 +58,8 @@ from radejax.training.metric_writer import MetricWriter, Scores, log_results
 from radejax.training.step import (
     Metrics,
     TrainState,
-    check_patterns,
     count_steps,
     create_state,
-    freezing,
     initial_variables,
     make_optimizer,
     make_schedule,
@@ -381,8 +379,6 @@ def _make_state_and_step(
 ) -> tuple[TrainState, loop.PlacedStep]:
     """Restores or initializes the state, and returns it with the function of a step."""
     train = config.train
-    use_ema = train.ema_decay is not None
-    is_frozen = freezing(model, train.freeze)
     optimizer = make_optimizer(train, make_schedule(train, data.steps_per_epoch))
 
     batch = loop.empty_batch(data.batches)
@@ -390,9 +386,13 @@ def _make_state_and_step(
     def initial() -> VariableDict:
         return initial_variables(model, config.seed, batch, variables, pretrained)
 
-    def create(variables: VariableDict) -> TrainState:
-        check_patterns(variables["params"], train.freeze)
-        return create_state(variables, optimizer, use_ema=use_ema, is_frozen=is_frozen)
+    create = functools.partial(
+        create_state,
+        optimizer=optimizer,
+        use_ema=train.ema_decay is not None,
+        model=model,
+        freeze=train.freeze,
+    )
 
     def place(state: TrainState) -> PyTree[NamedSharding]:
         return devices.state_sharding(state, mesh, train.parameter_sharding)

@@ -211,7 +211,8 @@ def create_state(
     optimizer: optax.GradientTransformation,
     *,
     use_ema: bool,
-    is_frozen: Callable[[str], bool] | None = None,
+    model: nn.Module | None = None,
+    freeze: Sequence[str] = (),
 ) -> TrainState:
     """Creates the state before the first step.
 
@@ -219,10 +220,16 @@ def create_state(
         variables: Variables of the model: "params" and any other collections.
         optimizer: Optimizer that `make_optimizer` returned.
         use_ema: Keep a moving average of the parameters.
-        is_frozen: Function from the path of a parameter to whether it is not trained;
-            None trains all parameters.
+        model: Model whose method `is_frozen`, if there is one, returns whether the
+            parameter of a path is not trained.
+        freeze: Patterns of further parameters or parts that are not trained, such as
+            "backbone/encoder*".
+
+    Raises:
+        UserError: A pattern matches no parameter, or they match all.
     """
-    params, frozen = split_parameters(variables["params"], is_frozen)
+    check_patterns(variables["params"], freeze)
+    params, frozen = split_parameters(variables["params"], model, freeze)
     return TrainState(
         step=jnp.zeros((), jnp.int32),
         num_skipped=jnp.zeros((), jnp.int32),
@@ -233,22 +240,6 @@ def create_state(
         ema_params=jax.tree.map(jnp.copy, params) if use_ema else None,
         frozen=frozen,
     )
-
-
-def freezing(model: nn.Module, patterns: Sequence[str]) -> Callable[[str], bool]:
-    """Returns the function from the path of a parameter to whether it is not trained.
-
-    Args:
-        model: Model, which may have a method `is_frozen` of the same kind.
-        patterns: Patterns of further parameters or parts, such as "backbone/encoder*".
-    """
-    own = getattr(model, "is_frozen", None)
-
-    def is_frozen(path: str) -> bool:
-        is_own = own is not None and own(path)
-        return is_own or any(_matches(path, pattern) for pattern in patterns)
-
-    return is_frozen
 
 
 def _matches(path: str, pattern: str) -> bool:
@@ -271,16 +262,22 @@ def check_patterns(params: Collection, patterns: Sequence[str]) -> None:
 
 
 def split_parameters(
-    params: Collection, is_frozen: Callable[[str], bool] | None
+    params: Collection, model: nn.Module | None, freeze: Sequence[str]
 ) -> tuple[Collection, Collection]:
     """Splits parameters into a tree of trained and a tree of frozen ones.
 
     Args:
         params: Parameters of the model.
-        is_frozen: See `create_state`.
+        model: See `create_state`.
+        freeze: See `create_state`.
     """
+    is_frozen = getattr(model, "is_frozen", lambda path: False)
     flat = flatten_dict(params, sep="/")
-    frozen = {n: x for n, x in flat.items() if is_frozen is not None and is_frozen(n)}
+    frozen = {
+        path: x
+        for path, x in flat.items()
+        if is_frozen(path) or any(_matches(path, pattern) for pattern in freeze)
+    }
     trained = {n: x for n, x in flat.items() if n not in frozen}
     return unflatten_dict(trained, sep="/"), unflatten_dict(frozen, sep="/")
 

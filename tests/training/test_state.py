@@ -14,7 +14,6 @@ from radejax.training.options import TrainOptions
 from radejax.training.step import (
     check_patterns,
     create_state,
-    freezing,
     make_optimizer,
     make_schedule,
     merge_variables,
@@ -129,7 +128,8 @@ def test_frozen_parameters_have_no_optimizer_state_and_no_average():
         {"params": params, "batch_stats": {"mean": jnp.zeros(2)}},
         optimizer,
         use_ema=True,
-        is_frozen=freezing(WithFrozenPart(), ("head/fix*",)),
+        model=WithFrozenPart(),
+        freeze=("head/fix*",),
     )
     assert jax.tree.leaves(jax.tree.map(jnp.shape, state.params)) == [3]
     for part in (state.opt_state, state.ema_params):
@@ -152,7 +152,7 @@ def test_patterns_are_of_parameters_or_of_whole_parts():
             {"backbone": {"encoder_1": 1}, "image": {"w": 3}},
         ),
     ):
-        parts = split_parameters(params, freezing(WithFrozenPart(), patterns))
+        parts = split_parameters(params, WithFrozenPart(), patterns)
         assert parts[1] == frozen
         assert merge_variables(*parts) == params
 
