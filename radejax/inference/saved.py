@@ -523,7 +523,7 @@ def starting_weights(
     init_from: PathLike | None = None,
     image_backbone_path: PathLike | None = None,
     embeddings_sha256: str | None = None,
-) -> tuple[VariableDict | None, VariableDict | None, str | None]:
+) -> tuple[VariableDict, str | None]:
     """Reads the weights that a training starts from, including frozen ones.
 
     Args:
@@ -536,28 +536,26 @@ def starting_weights(
             embeddings that replace the frozen backbone; None without embeddings.
 
     Returns:
-        Variables of the whole model, or None to initialize them randomly; the part of the
-        variables that replaces initialized ones, or None; and the checksum of the frozen
-        image backbone, or None if there is none.
+        Those variables of the model that replace initialized ones, and the checksum of
+        the frozen image backbone, or None if there is none.
 
     Raises:
         UserError: The weights do not fit the model; the message names the differences.
     """
-    variables = pretrained = None
+    from radejax.training.step import merge_variables  # optax takes long to import
+
+    weights: VariableDict = {"params": {}}
     if init_from is not None:
-        variables = _fitting_variables(init_from, model)
-    if variables is None or IMAGE_BACKBONE not in variables["params"]:
+        weights = _fitting_variables(init_from, model)
+    if IMAGE_BACKBONE not in weights["params"]:
         pretrained = image_backbone.load_image_backbone(
             image_backbone_path, model, embeddings_sha256
         )
-    digest = None
-    if models.has_camera(model) and model.options.image.freeze:
-        digest = embeddings_sha256
-        if digest is None:
-            given = pretrained or variables
-            assert given is not None  # `load_image_backbone` requires frozen weights
-            digest = image_backbone.weights_sha256(given["params"][IMAGE_BACKBONE])
-    return variables, pretrained, digest
+        weights = merge_variables(weights, pretrained or {})
+    digest = embeddings_sha256
+    if digest is None and models.has_camera(model) and model.options.image.freeze:
+        digest = image_backbone.weights_sha256(weights["params"][IMAGE_BACKBONE])
+    return weights, digest
 
 
 def _fitting_variables(path: PathLike, model: RadeNet) -> VariableDict:

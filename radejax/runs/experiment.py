@@ -130,15 +130,14 @@ def _run(
     digest = None
     if config.data.embeddings is not None:
         digest = open_embeddings(config.data.embeddings).source["weights_sha256"]
-    variables, pretrained, frozen_sha256 = starting_weights(
+    weights, frozen_sha256 = starting_weights(
         model, init_from, config.data.image_backbone, digest
     )
     if init_partial is not None:
         require(
             init_from is None, "--init-from", init_from, "none, or no --init-partial"
         )
-        part = matching_weights(init_partial, model)
-        pretrained = merge_variables(part, pretrained or {})
+        weights = merge_variables(matching_weights(init_partial, model), weights)
 
     with claimed(folder, config):
         info = run_info(folder, init_from, init_partial)
@@ -185,8 +184,7 @@ def _run(
             training_data,
             folder,
             mesh,
-            variables=variables,
-            pretrained=pretrained,
+            weights=weights,
             validate=validate,
             profile=profile,
         )
@@ -256,8 +254,7 @@ def fit(
     workdir: pathlib.Path,
     mesh: Mesh,
     *,
-    variables: VariableDict | None = None,
-    pretrained: VariableDict | None = None,
+    weights: VariableDict | None = None,
     validate: Validate | None = None,
     profile: PathLike | None = None,
 ) -> tuple[TrainState, bool]:
@@ -270,8 +267,7 @@ def fit(
         data: Data to train on.
         workdir: Folder of checkpoints and logs.
         mesh: Devices to train on.
-        variables: Variables of step 0, see `initial_variables`.
-        pretrained: Part of the variables of step 0, see `initial_variables`.
+        weights: Variables that replace initialized ones in step 0; None for no others.
         validate: Function that is called every `evaluate_every_epochs` epochs and, unless
             this field is 0, after the last step, see `Evaluation.validate`.
         profile: Folder for a profiler trace of the steps `config.logging.profile_steps`,
@@ -293,7 +289,7 @@ def fit(
         checkpoints = Checkpoints(workdir / "checkpoints", max_to_keep=kept)
         stack.enter_context(checkpoints)
         state, step = _make_state_and_step(
-            config, model, data, mesh, checkpoints, variables, pretrained
+            config, model, data, mesh, checkpoints, weights or {}
         )
         start = int(state.step)
         num_steps = count_steps(config.train, data.steps_per_epoch)
@@ -374,8 +370,7 @@ def _make_state_and_step(
     data: TrainingData,
     mesh: Mesh,
     checkpoints: Checkpoints,
-    variables: VariableDict | None,
-    pretrained: VariableDict | None,
+    weights: VariableDict,
 ) -> tuple[TrainState, loop.PlacedStep]:
     """Restores or initializes the state, and returns it with the function of a step."""
     train = config.train
@@ -384,7 +379,7 @@ def _make_state_and_step(
     batch = loop.empty_batch(data.batches)
 
     def initial() -> VariableDict:
-        return initial_variables(model, config.seed, batch, variables, pretrained)
+        return initial_variables(model, config.seed, batch, weights)
 
     create = functools.partial(
         create_state,

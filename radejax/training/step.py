@@ -314,8 +314,7 @@ def initial_variables(
     model: nn.Module,
     seed: int,
     batch: Batch,
-    variables: VariableDict | None = None,
-    pretrained: VariableDict | None = None,
+    weights: VariableDict,
 ) -> VariableDict:
     """Creates the variables of step 0.
 
@@ -323,13 +322,11 @@ def initial_variables(
         model: Detector of `models.build`, a `RadeNet` or `DinoRade`.
         seed: Seed of the run.
         batch: A batch with the shapes of the model's inputs.
-        variables: Variables to start from; initialized from the seed if None.
-        pretrained: Part of the variables that replaces initialized ones.
+        weights: Variables that replace initialized ones.
     """
-    if variables is None:
-        init_key, _ = run_keys(seed)
-        variables = model.init(init_key, *batch.model_inputs(), train=False)
-    return variables if pretrained is None else merge_variables(variables, pretrained)
+    init_key, _ = run_keys(seed)
+    variables = model.init(init_key, *batch.model_inputs(), train=False)
+    return merge_variables(variables, weights)
 
 
 # Step --------------------------------------------------------------------------------

@@ -125,7 +125,7 @@ def test_a_seed_initializes_the_variables(run, tiny, tmp_path):
     def initial(name: str, seed: int) -> Any:
         rates = {"learning_rate": 1e-30, "final_learning_rate": 0.0}
         config = tiny.config.replace(seed=seed, train={"num_epochs": 1} | rates)
-        options = {"steps_per_epoch": 1, "variables": None, "config": config}
+        options = {"steps_per_epoch": 1, "weights": None, "config": config}
         return run(tmp_path / name, **options)[0].params
 
     first = initial("a", 0)
