@@ -32,8 +32,7 @@ import flax.linen as nn
 import jax
 import numpy as np
 from flax.typing import VariableDict
-from jax.sharding import Mesh, NamedSharding
-from jaxtyping import PyTree
+from jax.sharding import Mesh
 
 from radejax import models
 from radejax.config import Config
@@ -389,15 +388,13 @@ def _make_state_and_step(
         freeze=train.freeze,
     )
 
-    def place(state: TrainState) -> PyTree[NamedSharding]:
-        return devices.state_sharding(state, mesh, train.parameter_sharding)
-
     state = loop.restore_or_initialize(
         checkpoints,
         data.batches,
         initial,
         create,
-        place,
+        mesh,
+        train.parameter_sharding,
         data.info.get("same", {}),
         models.external_parts(model),
     )

@@ -325,7 +325,8 @@ def test_debugging_works(tiny, tmp_path, one_device, setting):
                 tiny.loader(),
                 lambda: {"params": {"w": jnp.ones(2)}},
                 lambda x: create_state(x, optax.sgd(0.1), use_ema=False),
-                lambda x: devices.state_sharding(x, one_device, "replicated"),
+                one_device,
+                "replicated",
                 {},
             )
         placed = loop.place_step(step, state, one_device, seed=0)
