@@ -128,7 +128,7 @@ def step_of(config, model, variables, batch, precision):
         jax.tree.map(jnp.array, variables),
         optimizer,
         use_ema=False,
-        is_frozen=getattr(model, "is_frozen", None),
+        model=model,
     )
     map_grid = models.map_grid(GRID, model, "true")
     step = make_train_step(model, optimizer, map_grid, loss=config.loss)

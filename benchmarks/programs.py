@@ -103,7 +103,7 @@ def train_step(config, grid, size):
         create_state,
         optimizer=optimizer,
         use_ema=False,
-        is_frozen=getattr(model, "is_frozen", None),
+        model=model,
     )
     map_grid = models.map_grid(grid, model, "true")
     step = make_train_step(model, optimizer, map_grid, loss=config.loss)

@@ -20,7 +20,7 @@ def train(name: str = "quickstart:short", num_steps: int = 50) -> Detector:
     config = located(load_config(name))
     data = open_data(config)  # simulates and preprocesses what is missing
     frames = data.split("train")
-    batches = data.training_batches(frames, config.train, config.seed)
+    batches = data.training_batches()
     model = models.build(config.model)
     grid = models.map_grid(data.records.grid, model, config.data.azimuth_mapping)
     inputs = next(batches).model_inputs()

@@ -9,6 +9,7 @@ paths are completed, and all of them are made absolute.
 from __future__ import annotations
 
 import ast
+import functools
 import hashlib
 import importlib.util
 import logging
@@ -26,13 +27,7 @@ from annotated_types import MinLen
 from radejax import models
 from radejax.core.errors import UserError, require
 from radejax.core.files import JsonObject, as_path
-from radejax.core.options import (
-    Options,
-    Seed,
-    as_tuples,
-    did_you_mean,
-    find_function,
-)
+from radejax.core.options import Options, Seed, as_tuples, did_you_mean, find_function
 from radejax.core.structures import CLASSES
 from radejax.data.dataset import find_reader
 from radejax.data.options import DATA_PATHS, DataOptions
@@ -41,11 +36,7 @@ from radejax.evaluation.evaluation_set import SPACES
 from radejax.evaluation.results import EvaluationOptions
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.detection import LossOptions
-from radejax.models.options import (
-    RadeNetOptions,
-    axis_centers,
-    azimuth_axis_deg,
-)
+from radejax.models.options import RadeNetOptions, axis_centers, azimuth_axis_deg
 from radejax.simulation.config import SimulationOptions
 from radejax.training.options import LoggingOptions, TrainOptions
 
@@ -336,10 +327,7 @@ def with_texts(config: Config, texts: Mapping[str, str]) -> Config:
 def _read_text(config: Config, name: str, text: str) -> object:
     """Returns the first reading of a text that the type of a field allows."""
     *sections, field = name.split(".")
-    place: Any = config
-    for section in sections:
-        is_mapping = isinstance(place, Mapping)
-        place = place[section] if is_mapping else getattr(place, section)
+    place: Any = functools.reduce(getattr, sections, config)
     literal = _literal(text)
     info = getattr(type(place), "model_fields", {}).get(field)
     if info is None:  # a weight, or a parameter of the simulated radar

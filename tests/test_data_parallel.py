@@ -51,7 +51,7 @@ def _case(kind: str) -> tuple[Any, Batch, Any, Callable[..., Any]]:
         variables,
         optimizer,
         use_ema=False,
-        is_frozen=getattr(model, "is_frozen", None),
+        model=model,
     )
     grid = models.map_grid(small_models.small_grid(), model, "true")
     step = make_train_step(model, optimizer, grid, loss=config.loss)

@@ -96,16 +96,13 @@ def simulate(
                 click.echo(f"{name}: {value}")
         click.echo(f"wrote {out / FITTED} and {out / 'fit.png'}")
         return
-    simulation = SimulationOptions()
-    if config is not None:
-        section = radejax.load_config(config).simulation
-        if section is None:
-            raise UserError(f"{config} has no `simulation` section")
-        simulation = section
-    values = dict(simulation)
+    usual = radejax.load_config(config).simulation if config else SimulationOptions()
+    if usual is None:
+        raise UserError(f"{config} has no `simulation` section")
+    values = dict(usual)
     if full_size:
         sizes = {"azimuth_elements", "elevation_elements"}  # of the coarse radar
-        effects = {name: x for name, x in simulation.radar if name not in sizes}
+        effects = {name: x for name, x in usual.radar if name not in sizes}
         values |= FULL_SIZE | {"radar": effects}
     if radar is not None:
         values |= read_object(radar, "grid", "radar")
@@ -147,8 +144,8 @@ def check(
 
     how = {"deep": deep, "progress": not as_json}
     if config is None:
-        options["version"] = options["version"] or DataOptions().label_version
-        report = kradar_check.check_dataset(roots, **how, **options)
+        version = options.pop("label_version") or DataOptions().label_version
+        report = kradar_check.check_dataset(roots, version=version, **how, **options)
     else:
         frames = entry.read_frames(roots, config, **options)
         classes = radejax.load_config(config).classes

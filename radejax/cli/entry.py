@@ -327,7 +327,6 @@ labeled_frames = together(
     own_reader,
     click.option(
         "--label-version",
-        "version",
         help="Version of the labels: v1.0, v1.1, v2.0 or v2.1. Default: v2.1, or the config's.",
     ),
     part,
@@ -338,36 +337,28 @@ def read_frames(
     roots: Sequence[str],
     config: str | Config | None = None,
     *,
-    version: str | None = None,
-    sequences: Sequence[int] | None = None,
-    weather: Sequence[str] | None = None,
     any_visibility: bool = False,
-    **paths: str | None,
+    **fields: object,
 ) -> LabeledFrames[LabeledFrame]:
     """Reads the frames of folders by the reader of a config, that of K-Radar without one.
 
     Args:
         roots: Folders of the dataset.
         config: Config, or its file or name.
-        version: Version of the labels; the config's if None.
-        sequences: Sequences to read; all if None.
-        weather: Weathers to read; all if None.
         any_visibility: Whether objects of every visibility flag are read.
-        **paths: Other paths of `config.data`, such as `labels`; the config's if None.
+        **fields: Other fields of `config.data`. Without `sequences` and `weather`, all are
+            read; the others are the config's where they are None.
     """
     from radejax.data import dataset
 
     if isinstance(config, str):
         config = radejax.load_config(config)
     settings = config or radejax.Config()
-    options = settings.data.replace(
-        roots=roots,
-        label_version=version or settings.data.label_version,
-        sequences=sequences or (),
-        weather=weather or (),
-        visibility=None if any_visibility else settings.data.visibility,
-        **{name: path for name, path in paths.items() if path is not None},
-    )
+    changes: dict[str, object] = {"roots": roots, "sequences": (), "weather": ()}
+    changes |= {name: value for name, value in fields.items() if value is not None}
+    if any_visibility:
+        changes["visibility"] = None
+    options = settings.data.replace(**changes)
     return dataset.read_frames(options, settings.classes)
 
 

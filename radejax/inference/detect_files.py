@@ -112,14 +112,14 @@ def front_images(
 def _views(frames: FrameSequence, detector: Detector) -> list[View]:
     """Returns image file and camera of every frame, `NO_VIEW` unless it has both.
 
-    The list is empty for a radar-only model.
+    A radar-only model has none of them.
 
     Raises:
         UserError: There are images, and no calibration for any of them.
     """
     model = detector.model
     if not models.has_camera(model):
-        return []
+        return [NO_VIEW] * len(frames)
     options = detector.camera_options.replace(allow_missing=True)
     inputs = camera_inputs(frames, model.options.image.size, options)
     if any(frame.camera_path is not None for frame in frames):
@@ -230,7 +230,7 @@ def find_inputs(
         [frame.key for frame in frames],
         [frame.radar_path for frame in frames],
         lambda index: frames[index].read_projection(frames.grid),
-        _views(frames, detector) or [NO_VIEW] * len(frames),
+        _views(frames, detector),
     )
 
 

@@ -27,6 +27,7 @@ from flax.typing import VariableDict
 from radejax import models
 from radejax.config import Config
 from radejax.core import files
+from radejax.core.archives import read_safetensors
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import JsonObject, PathLike
 from radejax.core.manifest import read_checked
@@ -283,20 +284,14 @@ def _read_exported(folder: pathlib.Path) -> SavedModel:
     """Reads a folder that `save_model` wrote."""
     path = folder / CONFIG_FILE
     weights = folder / WEIGHTS_FILE
-    content = files.read_object(path)
-    data = weights.read_bytes()
+    content = read_checked(path)
     try:
         if (found := content.get("format")) != FORMAT:
             raise ValueError(
                 f"format is {found!r}, expected {FORMAT!r}: export the run again with "
                 f"radejax {__version__}"
             )
-        if hashlib.sha256(data).hexdigest() != content["sha256"][WEIGHTS_FILE]:
-            raise DataError(
-                f"{weights} is corrupted or of another model: its sha256 differs from "
-                f"the one in {CONFIG_FILE}; export or download it again"
-            )
-        arrays = safetensors.numpy.load(data)
+        arrays = read_safetensors(weights)
         arrays = {name: value.astype(np.float32) for name, value in arrays.items()}
         variables = unflatten_dict(arrays, sep="/")
         config = Config(**content["config"])
@@ -337,13 +332,13 @@ def _read_checkpoint(path: pathlib.Path, step: Step) -> SavedModel:
         )
     # Orbax takes a second to import, and the other kinds of models do not need it.
     from radejax.training.checkpoints import Checkpoints
-    from radejax.training.step import merge_parameters
+    from radejax.training.step import merge_variables
 
     with Checkpoints(folder, read_only=True) as checkpoints:
         chosen = checkpoints.best_step() if step == "best" else step
         state, info, number = checkpoints.restore_variables(chosen)
     trained = state["ema_params"] if state.get("ema_params") else state["params"]
-    params = merge_parameters(trained, state.get("frozen") or {})
+    params = merge_variables(trained, state.get("frozen") or {})
     try:
         config = Config(**info["config"])
     except UserError as error:
@@ -503,7 +498,7 @@ def _with_backbone(saved: SavedModel, given: PathLike | None) -> SavedModel:
         found = image_backbone.load_image_backbone(source, saved.model)
     elif start and files.as_path(start).exists() and not config.data.embeddings:
         source = start
-        found = _fitting_variables(start, config.model)
+        found = _fitting_variables(start, saved.model)
     if source is None:
         return saved
     backbone = found["params"].get(IMAGE_BACKBONE) if found else None
@@ -524,15 +519,15 @@ def _with_backbone(saved: SavedModel, given: PathLike | None) -> SavedModel:
 
 
 def starting_weights(
-    options: RadeNetOptions,
+    model: RadeNet,
     init_from: PathLike | None = None,
     image_backbone_path: PathLike | None = None,
     embeddings_sha256: str | None = None,
-) -> tuple[VariableDict | None, VariableDict | None, str | None]:
+) -> tuple[VariableDict, str | None]:
     """Reads the weights that a training starts from, including frozen ones.
 
     Args:
-        options: The section `config.model`.
+        model: Model that is trained.
         init_from: Path of a model that `load_model` accepts; None initializes all weights
             randomly, except those of the image backbone.
         image_backbone_path: Weights of the image backbone, see
@@ -541,43 +536,43 @@ def starting_weights(
             embeddings that replace the frozen backbone; None without embeddings.
 
     Returns:
-        Variables of the whole model, or None to initialize them randomly; the part of the
-        variables that replaces initialized ones, or None; and the checksum of the frozen
-        image backbone, or None if there is none.
+        Those variables of the model that replace initialized ones, and the checksum of
+        the frozen image backbone, or None if there is none.
 
     Raises:
         UserError: The weights do not fit the model; the message names the differences.
     """
-    variables = pretrained = None
+    from radejax.training.step import merge_variables  # optax takes long to import
+
+    weights: VariableDict = {"params": {}}
     if init_from is not None:
-        variables = _fitting_variables(init_from, options)
-    if variables is None or IMAGE_BACKBONE not in variables["params"]:
+        weights = _fitting_variables(init_from, model)
+    if IMAGE_BACKBONE not in weights["params"]:
         pretrained = image_backbone.load_image_backbone(
-            image_backbone_path, models.build(options), embeddings_sha256
+            image_backbone_path, model, embeddings_sha256
         )
-    digest = None
-    if isinstance(options, DinoRadeOptions) and options.image.freeze:
-        digest = embeddings_sha256
-        if digest is None:
-            given = pretrained or variables
-            assert given is not None  # `load_image_backbone` requires frozen weights
-            digest = image_backbone.weights_sha256(given["params"][IMAGE_BACKBONE])
-    return variables, pretrained, digest
+        weights = merge_variables(weights, pretrained or {})
+    digest = embeddings_sha256
+    if digest is None and models.has_camera(model) and model.options.image.freeze:
+        digest = image_backbone.weights_sha256(weights["params"][IMAGE_BACKBONE])
+    return weights, digest
 
 
-def _fitting_variables(path: PathLike, options: RadeNetOptions) -> VariableDict:
-    """Reads the weights of another run or an official file, which must fit `config.model`."""
-    wanted = options.to_dict()
+def _fitting_variables(path: PathLike, model: RadeNet) -> VariableDict:
+    """Reads the weights of another run or an official file, which must fit a model."""
+    wanted = model.options.to_dict()
     if files.as_path(path).is_dir():
         other = load_model(path)
         found = other.config.model.to_dict()
         if lines := files.differences(found, wanted, "config.model"):
             raise UserError(f"weights of {path} do not fit: {'; '.join(lines)}")
-        return other.variables
-    has_camera = isinstance(options, DinoRadeOptions)
-    structure = {} if has_camera else {n: x for n, x in wanted.items() if n != "name"}
-    variables = load_torch(path, **structure).variables
-    image_backbone.check_fits(models.build(options), variables, path)
+        variables = other.variables
+    elif models.has_camera(model):
+        variables = load_torch(path).variables
+    else:
+        del wanted["name"]
+        variables = load_torch(path, **wanted).variables
+    image_backbone.check_fits(model, variables, path)
     return variables
 
 

@@ -36,7 +36,6 @@ from radejax.inference.saved import SavedModel
 from radejax.models.options import DinoRadeOptions, RadeNetOptions
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
-from radejax.training.options import TrainOptions
 from radejax.training.step import make_schedule
 
 Frames = LabeledFrames[LabeledFrame]
@@ -72,6 +71,7 @@ class Data:
     """
 
     def __init__(self, config: Config) -> None:
+        self._config = config
         options = self.options = config.data
         assert options.records is not None  # `located` fills it in
         self._records_folder = options.records
@@ -200,11 +200,6 @@ class Data:
         """
         return "validation" if self.options.validation else "test"
 
-    @functools.cached_property
-    def usual_input(self) -> tuple[float, float]:
-        """`input_of` the frames to train on."""
-        return self.input_of("train")
-
     def input_of(self, split: str) -> tuple[float, float]:
         """Returns mean and standard deviation of the records of some frames of a split."""
         frames = list(self.split(split))
@@ -223,21 +218,17 @@ class Data:
         size = self._image_size
         return cameras.camera_inputs(frames, size, self.camera, self.features)
 
-    def training_batches(
-        self, frames: FrameSequence, train: TrainOptions, seed: int
-    ) -> grain.DatasetIterator[Batch]:
+    def training_batches(self) -> grain.DatasetIterator[Batch]:
         """Returns an endless, shuffled, checkpointable iterator over this process's batches.
 
-        Args:
-            frames: Frames to train on.
-            train: The section `config.train`.
-            seed: Seed of the order and the augmentation.
+        The batches are those of the train split.
 
         Raises:
             UserError: Images or calibrations are missing or of another size, no frame has
                 a usable image, or there are fewer frames than one batch needs.
         """
         options = self.options
+        frames = self.split("train")
         images = self.images(frames)
         cameras.require_images(frames, images)
         table = pipeline.make_table(
@@ -268,8 +259,11 @@ class Data:
             options.random_gain_db,
             [find_function(place, name) for place in options.augmentation],
         )
-        size = train.batch_size // jax.process_count()
-        loader = pipeline.LoaderOptions(size, seed, num_threads=options.num_threads)
+        loader = pipeline.LoaderOptions(
+            self._config.train.batch_size // jax.process_count(),
+            self._config.seed,
+            num_threads=options.num_threads,
+        )
         return pipeline.make_loader(table, loader, augment=augment)
 
 
@@ -400,7 +394,7 @@ def open_data(config: Config) -> Data:
 
 def _log_input(data: Data, model: RadeNetOptions) -> None:
     """Logs mean and standard deviation of the input; warns if they hinder the training."""
-    mean, spread = data.usual_input
+    mean, spread = data.input_of("train")
     _log.info("input: %.3f ± %.3f in the frames to train on", mean, spread)
     seen = model.input_scale * (mean - model.input_center)
     varied = model.input_scale * spread

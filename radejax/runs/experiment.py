@@ -32,8 +32,7 @@ import flax.linen as nn
 import jax
 import numpy as np
 from flax.typing import VariableDict
-from jax.sharding import Mesh, NamedSharding
-from jaxtyping import PyTree
+from jax.sharding import Mesh
 
 from radejax import models
 from radejax.config import Config
@@ -48,11 +47,7 @@ from radejax.data.dataset import FrameSequence
 from radejax.data.records import open_embeddings
 from radejax.evaluation.report import Report, Table, number, numbers, write_tables
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.inference.saved import (
-    FROZEN_BACKBONE,
-    matching_weights,
-    starting_weights,
-)
+from radejax.inference.saved import FROZEN_BACKBONE, matching_weights, starting_weights
 from radejax.runs.data import located, open_data
 from radejax.runs.evaluate import Evaluation, named_aps
 from radejax.training import hooks, loop
@@ -62,17 +57,14 @@ from radejax.training.metric_writer import MetricWriter, Scores, log_results
 from radejax.training.step import (
     Metrics,
     TrainState,
-    check_patterns,
     count_steps,
     create_state,
-    freezing,
     initial_variables,
     make_optimizer,
     make_schedule,
     make_train_step,
-    with_pretrained,
+    merge_variables,
 )
-from radejax.weights.image_backbone import check_fits
 
 _log = logging.getLogger(__name__)
 
@@ -110,21 +102,13 @@ def run(
         FileNotFoundError: A path does not exist.
     """
     folder = files.as_path(workdir).absolute()
-    _run(
-        config,
-        folder,
-        init_from=init_from,
-        init_partial=init_partial,
-        profile=profile,
-        mesh=mesh,
-    )
+    _run(config, folder, init_from, init_partial, profile, mesh)
     return folder
 
 
 def _run(
     config: Config,
     folder: pathlib.Path,
-    *,
     init_from: PathLike | None = None,
     init_partial: PathLike | None = None,
     profile: PathLike | None = None,
@@ -145,17 +129,14 @@ def _run(
     digest = None
     if config.data.embeddings is not None:
         digest = open_embeddings(config.data.embeddings).source["weights_sha256"]
-    variables, pretrained, frozen_sha256 = starting_weights(
-        config.model, init_from, config.data.image_backbone, digest
+    weights, frozen_sha256 = starting_weights(
+        model, init_from, config.data.image_backbone, digest
     )
-    if variables is not None:
-        check_fits(model, variables, str(init_from))
     if init_partial is not None:
         require(
             init_from is None, "--init-from", init_from, "none, or no --init-partial"
         )
-        part = matching_weights(init_partial, model)
-        pretrained = with_pretrained(part, pretrained or {})
+        weights = merge_variables(matching_weights(init_partial, model), weights)
 
     with claimed(folder, config):
         info = run_info(folder, init_from, init_partial)
@@ -171,14 +152,14 @@ def _run(
                 "no frames of the test split in %s: the run is trained and not evaluated",
                 ", ".join(data.options.roots),
             )
-        info |= {"input": data.usual_input, "data": data.describe()}
+        info |= {"input": data.input_of("train"), "data": data.describe()}
         info |= {"parts": config.own_parts()}
         if (before := folder / "run.json").exists():
             config.check_parts(files.read_object(before).get("parts", {}), folder)
         if devices.is_main():
             files.write_json(folder / "run.json", info)
         training_data = TrainingData(
-            batches=data.training_batches(frames, config.train, config.seed),
+            batches=data.training_batches(),
             steps_per_epoch=len(frames) // config.train.batch_size,
             grid=models.map_grid(grid, model, config.data.azimuth_mapping),
             info=checkpoint_info(
@@ -202,13 +183,7 @@ def _run(
             training_data,
             folder,
             mesh,
-            initial=functools.partial(
-                initial_variables,
-                model,
-                config.seed,
-                variables=variables,
-                pretrained=pretrained,
-            ),
+            weights=weights,
             validate=validate,
             profile=profile,
         )
@@ -278,7 +253,7 @@ def fit(
     workdir: pathlib.Path,
     mesh: Mesh,
     *,
-    initial: Callable[[Batch], VariableDict] | None = None,
+    weights: VariableDict | None = None,
     validate: Validate | None = None,
     profile: PathLike | None = None,
 ) -> tuple[TrainState, bool]:
@@ -291,8 +266,7 @@ def fit(
         data: Data to train on.
         workdir: Folder of checkpoints and logs.
         mesh: Devices to train on.
-        initial: Function from an empty batch to the variables of step 0, by
-            default `initial_variables` with the seed of the config.
+        weights: Variables that replace initialized ones in step 0; None for no others.
         validate: Function that is called every `evaluate_every_epochs` epochs and, unless
             this field is 0, after the last step, see `Evaluation.validate`.
         profile: Folder for a profiler trace of the steps `config.logging.profile_steps`,
@@ -309,14 +283,12 @@ def fit(
         UserError: The run would continue with other data, the warm-up is too long, or no
             space is left on the disk.
     """
-    if initial is None:
-        initial = functools.partial(initial_variables, model, config.seed)
     kept = config.train.checkpoints_to_keep
     with contextlib.ExitStack() as stack:
         checkpoints = Checkpoints(workdir / "checkpoints", max_to_keep=kept)
         stack.enter_context(checkpoints)
         state, step = _make_state_and_step(
-            config, model, data, mesh, checkpoints, initial
+            config, model, data, mesh, checkpoints, weights or {}
         )
         start = int(state.step)
         num_steps = count_steps(config.train, data.steps_per_epoch)
@@ -340,8 +312,14 @@ def fit(
             int(state.num_skipped),
             int(state.num_skipped_in_row),
         )
-        external = models.external_parts(model)
-        save = hooks.Save(checkpoints, data.batches, data.info, check, external, start)
+
+        def save(
+            step: int, state: TrainState, _: Metrics, *, best: float | None = None
+        ) -> None:
+            check.finish()
+            kept = state.without(models.external_parts(model))
+            checkpoints.save(step, kept, data.batches, info=data.info, best=best)
+
         due = functools.partial(hooks.every, num_steps)
         called: list[Hook] = [timed_batches, bar, due(log_every_steps, log), check]
         if validate is not None:
@@ -377,7 +355,8 @@ def fit(
         )
         last = int(state.step)
         is_finished = last >= num_steps and not should_stop()
-        save(last, state, {})
+        if last > start:
+            save(last, state, {})
         checkpoints.wait()
         if is_finished:
             check.check_total(num_steps)
@@ -390,27 +369,32 @@ def _make_state_and_step(
     data: TrainingData,
     mesh: Mesh,
     checkpoints: Checkpoints,
-    initial: Callable[[Batch], VariableDict],
+    weights: VariableDict,
 ) -> tuple[TrainState, loop.PlacedStep]:
     """Restores or initializes the state, and returns it with the function of a step."""
     train = config.train
-    use_ema = train.ema_decay is not None
-    is_frozen = freezing(model, train.freeze)
     optimizer = make_optimizer(train, make_schedule(train, data.steps_per_epoch))
 
-    def create(variables: VariableDict) -> TrainState:
-        check_patterns(variables["params"], train.freeze)
-        return create_state(variables, optimizer, use_ema=use_ema, is_frozen=is_frozen)
+    batch = loop.empty_batch(data.batches)
 
-    def place(state: TrainState) -> PyTree[NamedSharding]:
-        return devices.state_sharding(state, mesh, train.parameter_sharding)
+    def initial() -> VariableDict:
+        return initial_variables(model, config.seed, batch, weights)
+
+    create = functools.partial(
+        create_state,
+        optimizer=optimizer,
+        use_ema=train.ema_decay is not None,
+        model=model,
+        freeze=train.freeze,
+    )
 
     state = loop.restore_or_initialize(
         checkpoints,
         data.batches,
-        functools.partial(initial, loop.empty_batch(data.batches)),
+        initial,
         create,
-        place,
+        mesh,
+        train.parameter_sharding,
         data.info.get("same", {}),
         models.external_parts(model),
     )

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pathlib
-from collections.abc import Iterator, Mapping
 
 import numpy as np
+from flax.traverse_util import flatten_dict
 
 from radejax.core import files
 from radejax.core.errors import UserError
@@ -80,16 +80,8 @@ def _config_of(run: pathlib.Path) -> JsonObject:
     """Returns the fields of a run's config, and the weights that it started from."""
     started = files.read_object(run / "run.json")
     start = {name: started.get(name) for name in ("init_from", "init_partial")}
-    return {**dict(_fields(files.read_object(run / "config.json"))), **start}
-
-
-def _fields(values: JsonObject, prefix: str = "") -> Iterator[tuple[str, object]]:
-    """Yields dotted name and value of every field of a config as plain values."""
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _fields(dict(value), f"{prefix}{name}.")
-        else:
-            yield prefix + name, value
+    config = files.read_object(run / "config.json")
+    return {**flatten_dict(config, sep="."), **start}
 
 
 def _progress(run: pathlib.Path) -> JsonObject:

@@ -49,20 +49,17 @@ def _without_orbax_log() -> Iterator[None]:
 
     The root logger is not configured either.
     """
+
+    def is_of_others(record: logging.LogRecord) -> bool:
+        return "orbax" not in record.pathname
+
     log = absl_logging.get_absl_logger()
-    if _is_not_of_orbax in log.filters:  # within another block
-        yield
-        return
-    log.addFilter(_is_not_of_orbax)
+    log.addFilter(is_of_others)
     try:
         with keep_root_logger():
             yield
     finally:
-        log.removeFilter(_is_not_of_orbax)
-
-
-def _is_not_of_orbax(record: logging.LogRecord) -> bool:
-    return "orbax" not in record.pathname
+        log.removeFilter(is_of_others)
 
 
 class Checkpoints:
@@ -141,8 +138,9 @@ class Checkpoints:
         """Starts to save a checkpoint, and returns as soon as the arrays are copied.
 
         Args:
-            step: Step of the state, which names the checkpoint. It must be higher than
-                the steps of the existing checkpoints.
+            step: Step of the state, which names the checkpoint. It must not be below
+                the steps of the existing checkpoints; nothing is saved if there is one of
+                this step.
             state: Pytree of arrays.
             data_iterator: Grain iterator whose next batch belongs to `step`. All
                 processes share each batch and are at the same position.
@@ -152,6 +150,8 @@ class Checkpoints:
         Raises:
             DiskFullError: No space is left on the disk; earlier checkpoints stay intact.
         """
+        if step == self._manager.latest_step():
+            return
         description: JsonObject = {
             "info": dict(info),
             "position": data_iterator.get_state(),
@@ -267,7 +267,10 @@ class Checkpoints:
         handler = ocp.CompositeCheckpointHandler()
         try:
             if state is None:
-                state = self._saved_variables(step)
+                with ocp.PyTreeCheckpointer() as reader:
+                    metadata = reader.metadata(self.folder / str(step) / "state")
+                tree = metadata.item_metadata.tree
+                state = {name: tree[name] for name in _VARIABLES if name in tree}
                 numpy = ocp.RestoreArgs(restore_type=np.ndarray)
                 restore_args = jax.tree.map(lambda _: numpy, state)
             else:
@@ -311,13 +314,6 @@ class Checkpoints:
             f"checkpoint {step} in {self.folder} is corrupted ({reason}); there are "
             f"{self.steps()}"
         )
-
-    def _saved_variables(self, step: int) -> dict[str, PyTree]:
-        """Returns the metadata of the arrays in a checkpoint that are model variables."""
-        with ocp.PyTreeCheckpointer() as reader:
-            folder = self.folder / str(step) / "state"
-            saved = reader.metadata(folder).item_metadata.tree
-        return {name: saved[name] for name in _VARIABLES if name in saved}
 
     def _move_away(self, steps: list[int]) -> None:
         """Renames corrupted checkpoints, so that these steps can be saved again."""

@@ -23,10 +23,8 @@ from jaxtyping import Int
 from radejax.config import Config
 from radejax.core import devices
 from radejax.core.errors import DataError, require
-from radejax.core.grain_import import grain
 from radejax.core.structures import Batch
 from radejax.core.workers import usable_cpus
-from radejax.training.checkpoints import Checkpoints
 from radejax.training.metric_writer import MetricWriter
 from radejax.training.step import Metrics, TrainState, make_schedule
 
@@ -269,50 +267,6 @@ class CheckSkipped:
             self._next_warning = step + self.log_every_steps
             total = f"{skipped} so far" if skipped > 1 else "the first one"
             _log.warning("a step was skipped (%s): %s", total, text)
-
-
-@dataclasses.dataclass
-class Save:
-    """Hook that saves a checkpoint, unless the step is already saved.
-
-    Attributes:
-        checkpoints: Checkpoints of the run.
-        batches: Iterator whose next batch belongs to the saved state.
-        info: Plain values that are saved with each state.
-        check: Hook whose `finish` is called before a state is saved.
-        external: Parts of the model whose frozen parameters are not saved.
-        saved_step: Step of the state that was saved or restored last.
-    """
-
-    checkpoints: Checkpoints
-    batches: grain.DatasetIterator[Batch]
-    info: Mapping[str, object]
-    check: CheckSkipped
-    external: Sequence[str]
-    saved_step: int
-
-    def __call__(
-        self,
-        step: int,
-        state: TrainState,
-        metrics: Metrics,
-        *,
-        best: float | None = None,
-    ) -> None:
-        """Saves the state.
-
-        Args:
-            step: Number of steps taken.
-            state: State after them.
-            metrics: Metrics of the last step.
-            best: Metric that selects the best checkpoint.
-        """
-        if step == self.saved_step:
-            return
-        self.check.finish()
-        kept = state.without(self.external)
-        self.checkpoints.save(step, kept, self.batches, info=self.info, best=best)
-        self.saved_step = step
 
 
 class Trace(contextlib.ExitStack):

@@ -13,7 +13,6 @@ from flax.typing import VariableDict
 from jax.extend.core import ClosedJaxpr
 from jax.interpreters import partial_eval
 from jax.sharding import Mesh
-from jaxtyping import PyTree
 
 from radejax.core import devices, files
 from radejax.core.errors import UserError
@@ -110,7 +109,8 @@ def restore_or_initialize(
     batches: grain.DatasetIterator[Batch],
     initial: Callable[[], VariableDict],
     create: Callable[[VariableDict], TrainState],
-    place: Callable[[TrainState], PyTree],
+    mesh: Mesh,
+    parameter_sharding: devices.ParameterSharding,
     same: Mapping[str, object],
     external: Sequence[str] = (),
 ) -> TrainState:
@@ -121,7 +121,8 @@ def restore_or_initialize(
         batches: Iterator that is set to the saved position.
         initial: Function that returns the variables of step 0.
         create: Function that creates the state of step 0 from them.
-        place: Function from the shapes of the state to its shardings.
+        mesh: Devices of the run.
+        parameter_sharding: See `devices.state_sharding`.
         same: Plain values by name that must equal those in the checkpoint.
         external: Parts of the model whose frozen parameters are not in checkpoints.
 
@@ -131,7 +132,7 @@ def restore_or_initialize(
     """
     traced, shapes = jax.make_jaxpr(initial, return_shape=True)()
     abstract = jax.eval_shape(create, shapes)
-    placement = place(abstract)
+    placement = devices.state_sharding(abstract, mesh, parameter_sharding)
     wanted = jax.tree.map(lambda x, s: x.update(sharding=s), abstract, placement)
     restored = checkpoints.restore(wanted.without(external), batches)
     if restored is None:

@@ -198,7 +198,7 @@ class TrainState(struct.PyTreeNode):
     def eval_variables(self) -> VariableDict:
         """Variables for evaluation, with the averaged parameters if there are any."""
         params = self.params if self.ema_params is None else self.ema_params
-        return {"params": merge_parameters(params, self.frozen), **self.model_state}
+        return {"params": merge_variables(params, self.frozen), **self.model_state}
 
     def without(self, parts: Iterable[str]) -> TrainState:
         """Returns the state without the frozen parameters of parts of the model."""
@@ -211,7 +211,8 @@ def create_state(
     optimizer: optax.GradientTransformation,
     *,
     use_ema: bool,
-    is_frozen: Callable[[str], bool] | None = None,
+    model: nn.Module | None = None,
+    freeze: Sequence[str] = (),
 ) -> TrainState:
     """Creates the state before the first step.
 
@@ -219,10 +220,16 @@ def create_state(
         variables: Variables of the model: "params" and any other collections.
         optimizer: Optimizer that `make_optimizer` returned.
         use_ema: Keep a moving average of the parameters.
-        is_frozen: Function from the path of a parameter to whether it is not trained;
-            None trains all parameters.
+        model: Model whose method `is_frozen`, if there is one, returns whether the
+            parameter of a path is not trained.
+        freeze: Patterns of further parameters or parts that are not trained, such as
+            "backbone/encoder*".
+
+    Raises:
+        UserError: A pattern matches no parameter, or they match all.
     """
-    params, frozen = split_parameters(variables["params"], is_frozen)
+    check_patterns(variables["params"], freeze)
+    params, frozen = split_parameters(variables["params"], model, freeze)
     return TrainState(
         step=jnp.zeros((), jnp.int32),
         num_skipped=jnp.zeros((), jnp.int32),
@@ -233,22 +240,6 @@ def create_state(
         ema_params=jax.tree.map(jnp.copy, params) if use_ema else None,
         frozen=frozen,
     )
-
-
-def freezing(model: nn.Module, patterns: Sequence[str]) -> Callable[[str], bool]:
-    """Returns the function from the path of a parameter to whether it is not trained.
-
-    Args:
-        model: Model, which may have a method `is_frozen` of the same kind.
-        patterns: Patterns of further parameters or parts, such as "backbone/encoder*".
-    """
-    own = getattr(model, "is_frozen", None)
-
-    def is_frozen(path: str) -> bool:
-        is_own = own is not None and own(path)
-        return is_own or any(_matches(path, pattern) for pattern in patterns)
-
-    return is_frozen
 
 
 def _matches(path: str, pattern: str) -> bool:
@@ -271,35 +262,34 @@ def check_patterns(params: Collection, patterns: Sequence[str]) -> None:
 
 
 def split_parameters(
-    params: Collection, is_frozen: Callable[[str], bool] | None
+    params: Collection, model: nn.Module | None, freeze: Sequence[str]
 ) -> tuple[Collection, Collection]:
     """Splits parameters into a tree of trained and a tree of frozen ones.
 
     Args:
         params: Parameters of the model.
-        is_frozen: See `create_state`.
+        model: See `create_state`.
+        freeze: See `create_state`.
     """
+    is_frozen = getattr(model, "is_frozen", lambda path: False)
     flat = flatten_dict(params, sep="/")
-    frozen = {n: x for n, x in flat.items() if is_frozen is not None and is_frozen(n)}
+    frozen = {
+        path: x
+        for path, x in flat.items()
+        if is_frozen(path) or any(_matches(path, pattern) for pattern in freeze)
+    }
     trained = {n: x for n, x in flat.items() if n not in frozen}
     return unflatten_dict(trained, sep="/"), unflatten_dict(frozen, sep="/")
 
 
-def merge_parameters(params: Collection, frozen: Collection) -> Collection:
-    """Merges trained and frozen parameters; the inverse of `split_parameters`."""
-    flat = {**flatten_dict(params, sep="/"), **flatten_dict(frozen, sep="/")}
-    merged: Collection = unflatten_dict(flat, sep="/")
-    return merged
-
-
-def with_pretrained(variables: VariableDict, part: VariableDict) -> VariableDict:
-    """Returns variables with a part replaced, such as a pretrained image backbone.
+def merge_variables(variables: VariableDict, part: VariableDict) -> VariableDict:
+    """Returns variables with a part added or replaced; the inverse of `split_parameters`.
 
     Args:
-        variables: Variables of a model: "params" and other collections.
-        part: Tree of the variables to replace, such as
+        variables: Tree of the variables or parameters of a model.
+        part: Tree of those to replace, such as a pretrained image backbone,
             `{"params": {"image_backbone": params}}`. Entries that `variables` lack are
-            added.
+            added, such as frozen parameters.
 
     Raises:
         UserError: The shapes of a variable differ.
@@ -324,8 +314,7 @@ def initial_variables(
     model: nn.Module,
     seed: int,
     batch: Batch,
-    variables: VariableDict | None = None,
-    pretrained: VariableDict | None = None,
+    weights: VariableDict,
 ) -> VariableDict:
     """Creates the variables of step 0.
 
@@ -333,13 +322,11 @@ def initial_variables(
         model: Detector of `models.build`, a `RadeNet` or `DinoRade`.
         seed: Seed of the run.
         batch: A batch with the shapes of the model's inputs.
-        variables: Variables to start from; initialized from the seed if None.
-        pretrained: Part of the variables that replaces initialized ones.
+        weights: Variables that replace initialized ones.
     """
-    if variables is None:
-        init_key, _ = run_keys(seed)
-        variables = model.init(init_key, *batch.model_inputs(), train=False)
-    return variables if pretrained is None else with_pretrained(variables, pretrained)
+    init_key, _ = run_keys(seed)
+    variables = model.init(init_key, *batch.model_inputs(), train=False)
+    return merge_variables(variables, weights)
 
 
 # Step --------------------------------------------------------------------------------
@@ -376,7 +363,7 @@ def make_train_step(
         params: Collection, state: TrainState, batch: Batch, rng: jax.Array
     ) -> tuple[Float[jax.Array, ""], tuple[VariableDict, Metrics]]:
         maps, model_state = model.apply(
-            {"params": merge_parameters(params, state.frozen), **state.model_state},
+            {"params": merge_variables(params, state.frozen), **state.model_state},
             *batch.model_inputs(),
             train=True,
             rngs={"dropout": rng},

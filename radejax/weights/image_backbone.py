@@ -25,7 +25,7 @@ from radejax.weights.convert import Rules, StateDict
 def load_image_backbone(
     path: PathLike | None, model: RadeNet, embeddings_sha256: str | None = None
 ) -> VariableDict | None:
-    """Loads pretrained variables for `radejax.training.step.with_pretrained`.
+    """Loads pretrained variables for `radejax.training.step.merge_variables`.
 
     Args:
         path: DINOv3 or DINOv2 that `dinov3_hf.load` reads, or ResNet-50 file from
@@ -146,7 +146,7 @@ def load_resnet(
 
     Returns:
         `{"params": {"image_backbone", "image_neck"}, "batch_stats": {"image_neck"}}` for
-        `radejax.training.step.with_pretrained`, without the 1x1 projection, which only
+        `radejax.training.step.merge_variables`, without the 1x1 projection, which only
         DinoRADE has. A file of `save_resnet` has no last stage and gives only the
         parameters of "image_backbone".
 

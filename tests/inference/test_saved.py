@@ -63,7 +63,7 @@ def test_a_torch_file_is_loaded_like_a_folder(tmp_path):
     assert (loaded.step, loaded.run) == (None, {})
     assert loaded.grid.projection_shape == (256, 107, 101)
     assert len(loaded.config.classes) == options.num_classes
-    weights, *_ = starting_weights(options, path)
+    weights, _ = starting_weights(models.build(options), path)
     jax.tree.map(np.testing.assert_array_equal, weights, loaded.variables)
 
 
@@ -73,10 +73,9 @@ def test_a_torch_file_is_loaded_like_a_folder(tmp_path):
 def test_weights_of_another_run_need_the_same_model(tmp_path):
     model = small.saved()
     save_model(model, tmp_path)
-    variables, pretrained, _ = starting_weights(model.config.model, init_from=tmp_path)
-    assert pretrained is None
+    variables, _ = starting_weights(model.model, init_from=tmp_path)
     jax.tree.map(np.testing.assert_array_equal, variables, dict(model.variables))
-    assert starting_weights(model.config.model) == (None, None, None)
+    assert starting_weights(model.model) == ({}, None)
 
 
 def test_matching_weights_are_those_of_equal_name_and_shape(
@@ -224,7 +223,7 @@ def test_a_flipped_bit_of_the_weights_is_found(tmp_path):
 
 
 def test_folders_and_files_that_do_not_fit_are_named(tmp_path):
-    config, torch_file = small.radar_config().model, tmp_path / "best.safetensors"
+    model, torch_file = small.saved().model, tmp_path / "best.safetensors"
     _write_torch(torch_file)
     untrained, other = tmp_path / "run", tmp_path / "other"
     for folder in (untrained, other):
@@ -237,9 +236,9 @@ def test_folders_and_files_that_do_not_fit_are_named(tmp_path):
         (lambda: Detector.from_workdir(untrained), "a run that has trained"),
         (lambda: load_model(torch_file, step=3), "holds one model only, but step=3"),
         (lambda: load_model(torch_file, image_backbone="x"), "the model is RADE-Net"),
-        (lambda: starting_weights(config, other), r"do not fit: .*\.heatmap_prior is"),
+        (lambda: starting_weights(model, other), r"do not fit: .*\.heatmap_prior is"),
         (
-            lambda: starting_weights(config, image_backbone_path="dinov3"),
+            lambda: starting_weights(model, image_backbone_path="dinov3"),
             "RadeNet has no camera",
         ),
     ):

@@ -60,7 +60,7 @@ class Tiny:
         arguments = {
             "config": self.config,
             "model": self.model,
-            "initial": lambda _: self.variables,
+            "weights": self.variables,
         }
         mesh = devices.make_mesh(num_devices)
         return fit(data=data, workdir=workdir, mesh=mesh, **(arguments | changes))

@@ -125,7 +125,7 @@ def test_a_seed_initializes_the_variables(run, tiny, tmp_path):
     def initial(name: str, seed: int) -> Any:
         rates = {"learning_rate": 1e-30, "final_learning_rate": 0.0}
         config = tiny.config.replace(seed=seed, train={"num_epochs": 1} | rates)
-        options = {"steps_per_epoch": 1, "initial": None, "config": config}
+        options = {"steps_per_epoch": 1, "weights": None, "config": config}
         return run(tmp_path / name, **options)[0].params
 
     first = initial("a", 0)
@@ -325,7 +325,8 @@ def test_debugging_works(tiny, tmp_path, one_device, setting):
                 tiny.loader(),
                 lambda: {"params": {"w": jnp.ones(2)}},
                 lambda x: create_state(x, optax.sgd(0.1), use_ema=False),
-                lambda x: devices.state_sharding(x, one_device, "replicated"),
+                one_device,
+                "replicated",
                 {},
             )
         placed = loop.place_step(step, state, one_device, seed=0)

@@ -139,7 +139,7 @@ def test_two_steps_of_every_config(name, words):
         drawn(model, *batch.model_inputs()),
         optimizer,
         use_ema=False,
-        is_frozen=getattr(model, "is_frozen", None),
+        model=model,
     )
     step = jax.jit(
         make_train_step(

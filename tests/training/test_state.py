@@ -14,12 +14,10 @@ from radejax.training.options import TrainOptions
 from radejax.training.step import (
     check_patterns,
     create_state,
-    freezing,
     make_optimizer,
     make_schedule,
-    merge_parameters,
+    merge_variables,
     split_parameters,
-    with_pretrained,
 )
 
 
@@ -130,7 +128,8 @@ def test_frozen_parameters_have_no_optimizer_state_and_no_average():
         {"params": params, "batch_stats": {"mean": jnp.zeros(2)}},
         optimizer,
         use_ema=True,
-        is_frozen=freezing(WithFrozenPart(), ("head/fix*",)),
+        model=WithFrozenPart(),
+        freeze=("head/fix*",),
     )
     assert jax.tree.leaves(jax.tree.map(jnp.shape, state.params)) == [3]
     for part in (state.opt_state, state.ema_params):
@@ -153,9 +152,9 @@ def test_patterns_are_of_parameters_or_of_whole_parts():
             {"backbone": {"encoder_1": 1}, "image": {"w": 3}},
         ),
     ):
-        parts = split_parameters(params, freezing(WithFrozenPart(), patterns))
+        parts = split_parameters(params, WithFrozenPart(), patterns)
         assert parts[1] == frozen
-        assert merge_parameters(*parts) == params
+        assert merge_variables(*parts) == params
 
 
 PARAMS = {"backbone": {"w": 1}, "image": {"w": 3}}
@@ -196,10 +195,10 @@ def test_pretrained_parts_replace_their_like():
     proj = {"kernel": np.ones((3, 8)), "bias": np.zeros(8)}
     variables = {"params": {"image_neck": {"proj": proj}, "heads": {}}}
     part = {"params": {"image_neck": {"proj": {"bias": np.full(8, 7.0)}, "new": 1}}}
-    merged = with_pretrained(variables, part)
+    merged = merge_variables(variables, part)
     assert (merged["params"]["image_neck"]["proj"]["bias"] == 7).all()
     assert merged["params"]["image_neck"]["proj"]["kernel"] is proj["kernel"]
     assert merged["params"]["image_neck"]["new"] == 1
     wrong = {"params": {"image_neck": {"proj": {"bias": np.zeros(9)}}}}
     with pytest.raises(UserError, match=r"params/image_neck/proj/bias is \(9,\)"):
-        with_pretrained(variables, wrong)
+        merge_variables(variables, wrong)

@@ -100,7 +100,7 @@ def train(
         variables,
         optimizer,
         use_ema=False,
-        is_frozen=getattr(model, "is_frozen", None),
+        model=model,
     )
     placement = devices.state_sharding(state, mesh, "replicated")
     state = jax.device_put(state, placement)
