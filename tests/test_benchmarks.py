@@ -15,7 +15,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[1]
 
 
 @pytest.mark.slow  # compiles each stage on its own
-def test_stages_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stages_add_up(monkeypatch):
     monkeypatch.syspath_prepend(ROOT / "benchmarks")
     import stages
 
@@ -26,7 +26,7 @@ def test_stages_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.slow
-def test_benchmarks_are_measured_and_stored(tmp_path: pathlib.Path) -> None:
+def test_benchmarks_are_measured_and_stored(tmp_path):
     command = [sys.executable, "benchmarks/run.py", "--only", "loader"]
     subprocess.run(
         [*command, "--minutes", "0.2", "--out", str(tmp_path)],
@@ -41,9 +41,7 @@ def test_benchmarks_are_measured_and_stored(tmp_path: pathlib.Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
-def test_the_acceptance_stores_every_part_and_repeats_none(
-    tmp_path: pathlib.Path,
-) -> None:
+def test_the_acceptance_stores_every_part_and_repeats_none(tmp_path):
     command = [sys.executable, "benchmarks/accept.py", "--short"]
     command += ["--out", str(tmp_path), "--work", str(tmp_path / "work")]
     environment = {**os.environ, "JAX_PLATFORMS": "cpu"}

@@ -5,7 +5,6 @@ import json
 import math
 import pathlib
 import re
-from typing import Any
 
 import pytest
 
@@ -58,16 +57,16 @@ FIELDS = {name: value for name, value in WHOLE.fields() if value is not None}
 ANY_NUMBER = ("input_center", "radar_from_lidar_z_m", "layer_scale")
 
 
-def _check_rejected(fields: dict[str, Any], message: str) -> None:
+def _check_rejected(fields, message):
     with pytest.raises(UserError, match=rf"^config\.{message}") as rejected:
         WHOLE.with_fields(fields)
     assert "\n" not in str(rejected.value)
 
 
 @pytest.mark.parametrize("field", FIELDS)
-def test_a_value_of_a_wrong_type_or_range_is_named(field: str) -> None:
+def test_a_value_of_a_wrong_type_or_range_is_named(field):
     value = FIELDS[field]
-    wrong: list[Any] = [{"a": 1}, "many" if not isinstance(value, str) else 1]
+    wrong = [{"a": 1}, "many" if not isinstance(value, str) else 1]
     if type(value) is int:
         wrong += [2.5, -1]
     elif isinstance(value, float):
@@ -87,7 +86,7 @@ def test_a_value_of_a_wrong_type_or_range_is_named(field: str) -> None:
         ("evaluation.roi", (72.0, 0.0, -6.4, 6.4, -2.0, 6.0)),
     ],
 )
-def test_a_value_that_its_type_allows_is_named(field: str, value: Any) -> None:
+def test_a_value_that_its_type_allows_is_named(field, value):
     _check_rejected({field: value}, rf"{re.escape(field)}(\[\d+\])* is ")
 
 
@@ -109,9 +108,7 @@ def test_a_value_that_its_type_allows_is_named(field: str, value: Any) -> None:
         ),
     ],
 )
-def test_what_one_field_requires_of_another(
-    fields: dict[str, Any], message: str
-) -> None:
+def test_what_one_field_requires_of_another(fields, message):
     _check_rejected(fields, message)
 
 
@@ -128,15 +125,15 @@ def test_what_one_field_requires_of_another(
         },
     ],
 )
-def test_fields_that_fit_each_other(fields: dict[str, Any]) -> None:
+def test_fields_that_fit_each_other(fields):
     assert dict(WHOLE.with_fields(fields).fields()).items() >= fields.items()
 
 
-def _set(section: Any, field: str) -> None:
+def _set(section, field):
     setattr(section, field, 3)
 
 
-def test_other_user_errors(tmp_path: pathlib.Path) -> None:
+def test_other_user_errors(tmp_path):
     mine, other = tmp_path / "mine.py", tmp_path / "other.py"
     mine.write_text("x = 1\n")
     other.write_text("def get_config(arg=None): return {'seed': 1}\n")
@@ -164,7 +161,7 @@ def test_other_user_errors(tmp_path: pathlib.Path) -> None:
 # Presets -----------------------------------------------------------------------------
 
 
-def _words(name: str) -> list[str]:
+def _words(name):
     module = load_module(CONFIGS / f"{name}.py")
     if name.startswith("quickstart"):
         words = ["radar", "radar,short", "silhouettes", "silhouettes,short"]
@@ -178,7 +175,7 @@ def _words(name: str) -> list[str]:
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in CONFIGS.glob("*.py")))
-def test_every_preset_can_be_built_and_stored_as_json(name: str) -> None:
+def test_every_preset_can_be_built_and_stored_as_json(name):
     assert config_file(name).samefile(CONFIGS / f"{name}.py")
     choices = _words(name)
     for words in choices:
@@ -199,7 +196,7 @@ def test_every_preset_can_be_built_and_stored_as_json(name: str) -> None:
         ("dinorade:official", "loss.heatmap_sigma_bins", 3.0),
     ],
 )
-def test_fields_of_presets(name: str, field: str, expected: Any) -> None:
+def test_fields_of_presets(name, field, expected):
     assert dict(load_config(name).fields())[field] == expected
 
 
@@ -221,33 +218,31 @@ def test_fields_of_presets(name: str, field: str, expected: Any) -> None:
         ("loss.weights.focal", "3", 3.0),
     ],
 )
-def test_a_text_becomes_the_value_of_a_field(
-    name: str, text: str, expected: Any
-) -> None:
+def test_a_text_becomes_the_value_of_a_field(name, text, expected):
     found = dict(with_texts(WHOLE, {name: text}).fields())[name]
     assert found == expected
     assert type(found) is type(expected)
 
 
-def test_texts_are_set_together_and_models_have_the_options_of_their_class() -> None:
+def test_texts_are_set_together_and_models_have_the_options_of_their_class():
     texts = {"classes": "Sedan", "model.num_classes": "1"}
     assert with_texts(Config(), texts).classes == ("Sedan",)
     assert Config().replace(model={"name": "dinorade"}).model == DinoRadeOptions()
 
 
-def test_names_of_runs() -> None:
+def test_names_of_runs():
     assert config_name("configs/quickstart.py") == "quickstart"
     assert config_name("a/b/radenet.py:stem,sedan") == "radenet-stem-sedan"
 
 
-def test_data_paths_differ_from_machine_to_machine() -> None:
+def test_data_paths_differ_from_machine_to_machine():
     values = WHOLE.replace(data={"roots": ("/a",)}).without_data_paths()
     assert values == WHOLE.without_data_paths()
     assert values["data"]["embeddings"] is None
     assert values["train"]["batch_size"] == WHOLE.train.batch_size
 
 
-def test_axes_replace_the_arguments_of_a_reduced_grid() -> None:
+def test_axes_replace_the_arguments_of_a_reduced_grid():
     """The field has two kinds of sections, whose fields are not merged."""
     grid = RadarGrid.kradar()
     options = SimulationOptions()
@@ -259,7 +254,7 @@ def test_axes_replace_the_arguments_of_a_reduced_grid() -> None:
         options.replace(grid={"num_rang": 32})
 
 
-def test_every_class_may_have_its_threshold_and_calibration() -> None:
+def test_every_class_may_have_its_threshold_and_calibration():
     texts = {"decode.score_threshold": "0.1,0.2,0.3,0.4,0.5"}
     found = with_texts(Config(), texts).decode.score_threshold
     assert found == (0.1, 0.2, 0.3, 0.4, 0.5)

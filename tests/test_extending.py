@@ -6,9 +6,7 @@ import pathlib
 import re
 import shutil
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import jax
 import numpy as np
@@ -22,7 +20,7 @@ from radejax.cli.main import main
 from radejax.config import Config
 from radejax.core.errors import UserError
 from radejax.data.check import check_frames
-from radejax.data.dataset import LabeledFrames, find_reader
+from radejax.data.dataset import find_reader
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.check import check_dataset
 from radejax.data.options import DataOptions
@@ -36,7 +34,6 @@ from radejax.inference.export import export
 from radejax.runs import experiment
 from radejax.runs.data import Data, located
 from radejax.runs.evaluate import evaluate_run
-from radejax.visualize.style import Scene
 
 from . import small_models as small
 from . import toy_reader
@@ -55,7 +52,7 @@ RADAR_BLOCKS = re.findall(
 
 
 @pytest.fixture(autouse=True)
-def page(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def page(tmp_path, monkeypatch):
     """Save the reader and the blocks of the page as modules that Python finds."""
     folder = tmp_path / "modules"
     folder.mkdir()
@@ -66,13 +63,13 @@ def page(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[No
     _forget()
 
 
-def _forget() -> None:
+def _forget():
     """Remove the imported modules, as if a new process had started."""
     for name in ("toy", "parts"):
         sys.modules.pop(name, None)
 
 
-def _config() -> Config:
+def _config():
     """Config of the small model with every component of the page."""
     parts = importlib.import_module("parts")
     config = small.radar_config()
@@ -114,7 +111,7 @@ def _config() -> Config:
     )
 
 
-def _write_toy(root: pathlib.Path) -> pathlib.Path:
+def _write_toy(root):
     """Write two drives of two frames, the first frame with an image."""
     rng, grid = np.random.default_rng(0), small.small_grid()
     (root / "1").mkdir(parents=True)
@@ -137,12 +134,12 @@ def _write_toy(root: pathlib.Path) -> pathlib.Path:
     return root
 
 
-def _read_toy(root: pathlib.Path) -> LabeledFrames:
+def _read_toy(root):
     options = DataOptions(format="toy:Toy", roots=(str(root),))
     return find_reader(options.format).from_options(options, ("Sedan",))
 
 
-def test_configs_may_name_the_parts_and_the_model_has_them() -> None:
+def test_configs_may_name_the_parts_and_the_model_has_them():
     model = models.build(_config().model)
     assert model.options.exponent == 3.0
     projection = jax.ShapeDtypeStruct((1, 16, 14, 5), "float32")
@@ -153,14 +150,12 @@ def test_configs_may_name_the_parts_and_the_model_has_them() -> None:
 
 
 def test_records_of_other_files_or_of_another_reader_are_reported(
-    tmp_path: pathlib.Path,
-    caplog: pytest.LogCaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    tmp_path, caplog, monkeypatch
+):
     root, reader = _write_toy(tmp_path), find_reader("toy:Toy")
     toy = sys.modules["toy"]
 
-    def again() -> str:
+    def again():
         caplog.clear()
         with caplog.at_level("INFO", "radejax"):
             preprocess(_read_toy(root), tmp_path / "records")
@@ -194,14 +189,12 @@ def test_records_of_other_files_or_of_another_reader_are_reported(
         again()
 
 
-def test_commands_read_such_data_by_the_config(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_commands_read_such_data_by_the_config(tmp_path, monkeypatch):
     root = _write_toy(tmp_path / "toy")
     config = Config().replace(data={"format": "toy:Toy"}, evaluation={"roi": None})
     given = ["--config", small.write_config(tmp_path / "config.py", config)]
 
-    def run(*words: object, code: int = 0) -> str:
+    def run(*words, code=0):
         done = CliRunner().invoke(main, [str(word) for word in words])
         assert done.exit_code == code, done.output
         return done.output
@@ -221,7 +214,7 @@ def test_commands_read_such_data_by_the_config(
     assert "2 preprocessed" in text
     assert Records.open(out).keys() == {"2/0001", "2/0002"}
 
-    scenes: list[Scene] = []
+    scenes = []
     drawn = radejax.draw_frame
     monkeypatch.setattr(
         radejax, "draw_frame", lambda scene: scenes.append(scene) or drawn(scene)
@@ -240,9 +233,7 @@ def test_commands_read_such_data_by_the_config(
     assert "no frames of these" in run("overlay", "7/0001", *given, code=2)
 
 
-def test_objects_that_cannot_be_learned_are_left_out_and_counted(
-    tmp_path: pathlib.Path,
-) -> None:
+def test_objects_that_cannot_be_learned_are_left_out_and_counted(tmp_path):
     root = _write_toy(tmp_path)
     path = root / "1" / "0001.npz"
     good = [12.0, 1.0, 0.0, 4.2, 1.8, 1.6, 0.1]
@@ -272,9 +263,7 @@ def test_objects_that_cannot_be_learned_are_left_out_and_counted(
         Data(config)
 
 
-def test_what_a_reader_forgets_is_named(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_reader_forgets_is_named(tmp_path, monkeypatch):
     root = _write_toy(tmp_path)
     toy, classes = importlib.import_module("toy"), ("Sedan",)
     frames = list(_read_toy(root))
@@ -325,9 +314,7 @@ def test_what_a_reader_forgets_is_named(
 
 
 @pytest.mark.parametrize("is_flat", [False, True])
-def test_written_folders_are_read(
-    is_flat: bool, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_written_folders_are_read(is_flat, tmp_path, monkeypatch):
     """Also those of a radar that measures only range and azimuth, with one bin per axis."""
     (written,) = (block for block in RADAR_BLOCKS if "write_splits" in block)
     if is_flat:
@@ -360,7 +347,7 @@ def test_written_folders_are_read(
         ("data.format", "nuscenes", "'nuscenes', expected 'kradar' or module:Object"),
     ],
 )
-def test_a_wrong_part_is_named(name: str, value: Any, message: str) -> None:
+def test_a_wrong_part_is_named(name, value, message):
     config, section = _config(), name.partition(".")[0]
     with pytest.raises(UserError, match=rf"^config\.{section}\..*{message}"):
         config.with_fields({name: value}).check_imports()
@@ -368,18 +355,15 @@ def test_a_wrong_part_is_named(name: str, value: Any, message: str) -> None:
 
 @pytest.mark.slow
 def test_own_parts_are_imported_wherever_a_run_is_opened(
-    tmp_path: pathlib.Path,
-    caplog: pytest.LogCaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
-    one_device: jax.sharding.Mesh,
-) -> None:
+    tmp_path, caplog, monkeypatch, one_device
+):
     """One step on the toy data, then each command as if in a process of its own."""
     root, folder = _write_toy(tmp_path / "toy"), tmp_path / "run"
     config = _config()
     classes = ("Tram", *config.classes[1:])
     config = config.replace(data={"roots": (str(root),)}, classes=classes)
     experiment.run(config, folder, mesh=one_device)
-    row: dict[str, Any] = json.loads((folder / "metrics.jsonl").read_text())
+    row = json.loads((folder / "metrics.jsonl").read_text())
     assert row["step"] == 1
     terms = ("focal", "gwd", "height_loss", "velocity_loss")
     assert np.isfinite([row[name] for name in terms]).all()

@@ -1,10 +1,8 @@
 """Commands on K-Radar's reduced releases, with two disks and a zip file of labels."""
 
 import json
-import pathlib
 import types
 import zipfile
-from typing import Any
 
 import click.testing
 import numpy as np
@@ -25,7 +23,7 @@ from .. import small_models as small
 RELEASES = ("polar3d", "rpc")
 
 
-def _run(*arguments: object, code: int = 0) -> click.testing.Result:
+def _run(*arguments, code=0):
     arguments = tuple(map(str, arguments))
     result = click.testing.CliRunner().invoke(main.main, arguments)
     assert result.exit_code == code, result.output
@@ -33,7 +31,7 @@ def _run(*arguments: object, code: int = 0) -> click.testing.Result:
 
 
 @pytest.fixture(scope="module")
-def tensors(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+def tensors(tmp_path_factory):
     """A simulated root with radar tensors."""
     grid = {"num_doppler": 4, "num_range": 24, "num_elevation": 3, "num_azimuth": 16}
     simulation = SimulationOptions(
@@ -44,11 +42,7 @@ def tensors(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
 
 
 @pytest.fixture(scope="module", params=RELEASES)
-def disks(
-    request: pytest.FixtureRequest,
-    tensors: pathlib.Path,
-    tmp_path_factory: pytest.TempPathFactory,
-) -> Any:
+def disks(request, tensors, tmp_path_factory):
     """Two disks, one with radar frames only, and a zip file of the labels."""
     folder = tmp_path_factory.mktemp(request.param)
     others, radar = folder / "others", folder / "radar"
@@ -66,7 +60,7 @@ def disks(
     return request.param, (radar, others), labels
 
 
-def _model(doppler_bins: int, root: pathlib.Path, release: str | None) -> SavedModel:
+def _model(doppler_bins, root, release):
     """An untrained radar-only model for the simulated radar."""
     config = small.radar_config().replace(
         data={"release": release}, model={"doppler_bins": doppler_bins}
@@ -78,9 +72,7 @@ def _model(doppler_bins: int, root: pathlib.Path, release: str | None) -> SavedM
     return SavedModel(config, grid, small.drawn(model, inputs))
 
 
-def test_frames_are_checked_preprocessed_and_drawn(
-    disks: Any, tmp_path: pathlib.Path
-) -> None:
+def test_frames_are_checked_preprocessed_and_drawn(disks, tmp_path):
     release, roots, labels = disks
     words = (*roots, "--labels", labels)
     report = json.loads(_run("data", "check", *words, "--deep", "--json").output)
@@ -115,9 +107,7 @@ def test_the_full_size_keeps_the_radar_of_the_config(tmp_path, monkeypatch):
     assert dict(options.radar) == {"preset": "ideal", "noise_db": 100.0}
 
 
-def test_boxes_are_found_in_files_and_arrays(
-    disks: Any, tensors: pathlib.Path, tmp_path: pathlib.Path
-) -> None:
+def test_boxes_are_found_in_files_and_arrays(disks, tensors, tmp_path):
     release, roots, _ = disks
     saved = _model({"polar3d": 4, "rpc": 0}[release], tensors, release)
     save_model(saved, tmp_path / "model")
@@ -143,9 +133,7 @@ def test_boxes_are_found_in_files_and_arrays(
 
 
 @pytest.mark.parametrize("release", [None, "polar3d", "rpc"])
-def test_a_detector_takes_the_form_that_it_was_trained_on(
-    disks: Any, tensors: pathlib.Path, release: str | None
-) -> None:
+def test_a_detector_takes_the_form_that_it_was_trained_on(disks, tensors, release):
     found, roots, _ = disks
     detector = Detector(_model(4, tensors, release), batch_sizes=(1,))
     path = next(roots[0].glob(f"1/{found}_*.npy"))
@@ -158,9 +146,7 @@ def test_a_detector_takes_the_form_that_it_was_trained_on(
                 detector(frame)
 
 
-def test_points_of_two_disks(
-    disks: Any, tensors: pathlib.Path, tmp_path: pathlib.Path
-) -> None:
+def test_points_of_two_disks(disks, tensors, tmp_path):
     release, (radar, others), _ = disks
     (radar / "9").mkdir(exist_ok=True)
     (radar / "9" / f"{release}_00001.npy").write_bytes(b"no array")
@@ -190,9 +176,7 @@ def test_points_of_two_disks(
 @pytest.mark.slow
 @pytest.mark.usefixtures("commands_on_one_device")
 @pytest.mark.parametrize("doppler_bins", [4, 0])
-def test_a_run_is_trained_evaluated_and_detects(
-    disks: Any, tmp_path: pathlib.Path, doppler_bins: int
-) -> None:
+def test_a_run_is_trained_evaluated_and_detects(disks, tmp_path, doppler_bins):
     from radejax.cli.train import train
 
     release, roots, labels = disks

@@ -1,7 +1,6 @@
 """The command line: help with examples, JSON, exit codes, no tracebacks."""
 
 import json
-import pathlib
 import sys
 from types import SimpleNamespace
 
@@ -18,11 +17,11 @@ from radejax.inference.saved import save_model
 from .. import small_models
 
 
-def _run(*arguments: object) -> click.testing.Result:
+def _run(*arguments):
     return click.testing.CliRunner().invoke(main.main, [str(a) for a in arguments])
 
 
-def _commands() -> list[list[str]]:
+def _commands():
     found = []
     for name, command in main.main.commands.items():
         if isinstance(command, click.Group):
@@ -33,7 +32,7 @@ def _commands() -> list[list[str]]:
 
 
 @pytest.mark.parametrize("command", _commands(), ids=" ".join)
-def test_help_shows_an_example(command: list[str]) -> None:
+def test_help_shows_an_example(command):
     result = _run(*command, "--help")
     assert result.exit_code == 0
     assert "Example: radejax " + " ".join(command) in " ".join(result.output.split())
@@ -57,9 +56,7 @@ def test_help_shows_an_example(command: list[str]) -> None:
         ),
     ],
 )
-def test_wrong_use_is_exit_code_2_and_a_clear_line(
-    arguments: list[str], message: str, tmp_path: pathlib.Path
-) -> None:
+def test_wrong_use_is_exit_code_2_and_a_clear_line(arguments, message, tmp_path):
     result = _run(*arguments)
     assert result.exit_code == 2
     assert message in result.output
@@ -67,7 +64,7 @@ def test_wrong_use_is_exit_code_2_and_a_clear_line(
 
 
 @pytest.fixture
-def root(tmp_path: pathlib.Path) -> pathlib.Path:
+def root(tmp_path):
     """A K-Radar root with one label and nothing else."""
     label = Label("Sedan", (10.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0), "R", 1)
     path = tmp_path / "kradar" / "1" / "info_label_v2_1" / "00033_00001.txt"
@@ -75,17 +72,13 @@ def root(tmp_path: pathlib.Path) -> pathlib.Path:
     return tmp_path / "kradar"
 
 
-def test_a_folder_without_frames_says_what_was_looked_for(
-    root: pathlib.Path, tmp_path: pathlib.Path
-) -> None:
+def test_a_folder_without_frames_says_what_was_looked_for(root, tmp_path):
     result = _run("detect", root, "--workdir", MODEL, "--out", tmp_path / "out")
     assert result.exit_code == 2
     assert "tesseract_*.mat" in result.output
 
 
-def test_failed_frames_are_listed_with_exit_code_1(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_failed_frames_are_listed_with_exit_code_1(tmp_path, monkeypatch):
     count = {"frames": 1, "boxes": 2, "clipped": 0, "truncated": 0, "done": 0}
     failed = {f"5/{i:05d}": "x of the box is nan" for i in range(30)}
     place = "radejax.inference.detect_files"
@@ -104,7 +97,7 @@ def test_failed_frames_are_listed_with_exit_code_1(
     assert json.loads(result.stdout)["failed"] == failed
 
 
-def test_debug_shows_the_traceback(tmp_path: pathlib.Path) -> None:
+def test_debug_shows_the_traceback(tmp_path):
     arguments = ("export", tmp_path, "--out", tmp_path / "out")
     plain = _run(*arguments)
     assert plain.exit_code == 2
@@ -112,14 +105,12 @@ def test_debug_shows_the_traceback(tmp_path: pathlib.Path) -> None:
     assert isinstance(_run(*arguments, "--debug").exception, FileNotFoundError)
 
 
-def test_evaluate_takes_flags_as_its_script_does(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_evaluate_takes_flags_as_its_script_does(monkeypatch):
     from radejax.runs import evaluate
 
     seen = []
 
-    def evaluate_run(workdir: str, **options: object) -> SimpleNamespace:
+    def evaluate_run(workdir, **options):
         seen.append((workdir, options))
         return SimpleNamespace(metrics={}, folder="there")
 
@@ -130,7 +121,7 @@ def test_evaluate_takes_flags_as_its_script_does(
     assert seen.pop() == ("run", {"step": "best", "split": "test", "other": other})
 
 
-def test_export_takes_an_exported_folder(tmp_path: pathlib.Path) -> None:
+def test_export_takes_an_exported_folder(tmp_path):
     packed = tmp_path / "packed"
     save_model(small_models.saved(), packed)
     done = _run("export", packed, "--out", tmp_path / "hub", "--format", "huggingface")
@@ -140,9 +131,7 @@ def test_export_takes_an_exported_folder(tmp_path: pathlib.Path) -> None:
         assert written == (packed / name).read_bytes()
 
 
-def test_roots_are_separate_repeated_or_with_commas(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_roots_are_separate_repeated_or_with_commas(tmp_path, monkeypatch):
     from radejax.data.kradar import check
 
     names = ("a", "b", "c", "d,e")
@@ -150,7 +139,7 @@ def test_roots_are_separate_repeated_or_with_commas(
         (tmp_path / name).mkdir()
     monkeypatch.chdir(tmp_path)
 
-    def look(roots: object, *_: object, **__: object) -> None:
+    def look(roots, *_, **__):
         raise UserError(f"opened {' '.join(map(str, roots))}")
 
     monkeypatch.setattr(check, "check_dataset", look)
@@ -160,14 +149,12 @@ def test_roots_are_separate_repeated_or_with_commas(
     assert "opened a b c" in _run("overlay", "1", "--data", "a,b", "--data", "c").output
 
 
-def test_a_part_of_the_data_is_chosen(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: pathlib.Path
-) -> None:
+def test_a_part_of_the_data_is_chosen(monkeypatch, tmp_path):
     from radejax.data.kradar import check
 
     seen = []
 
-    def look(*_: object, **options: object) -> None:
+    def look(*_, **options):
         seen.append((options["sequences"], options["weather"]))
         raise UserError("opened")
 

@@ -1,19 +1,17 @@
 """`radejax train`, which train.py also runs: configs by name, fields, messages."""
 
 import json
-import pathlib
 
 import click
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import CliRunner
 from matplotlib.figure import Figure
 
 from radejax.cli import entry
 from radejax.cli.train import train
-from radejax.config import Config
 
 
-def _train(*arguments: str) -> Result:
+def _train(*arguments):
     return CliRunner().invoke(train, list(arguments), prog_name="train")
 
 
@@ -35,9 +33,7 @@ def _train(*arguments: str) -> Result:
         (["--config=radnet:official"], "did you mean radenet?"),
     ],
 )
-def test_wrong_use_is_one_line_and_writes_nothing(
-    arguments: list[str], message: str, tmp_path: pathlib.Path
-) -> None:
+def test_wrong_use_is_one_line_and_writes_nothing(arguments, message, tmp_path):
     run = tmp_path / "run"
     ended = _train("--config=quickstart:short", f"--workdir={run}", *arguments)
     assert ended.exit_code == entry.WRONG_USE
@@ -46,12 +42,10 @@ def test_wrong_use_is_one_line_and_writes_nothing(
     assert not run.exists()
 
 
-def test_samples_are_drawn_instead_of_training(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    asked: list[Config] = []
+def test_samples_are_drawn_instead_of_training(tmp_path, monkeypatch):
+    asked = []
 
-    def draw(config: Config) -> Figure:
+    def draw(config):
         asked.append(config)
         return Figure()
 
@@ -69,7 +63,7 @@ def test_samples_are_drawn_instead_of_training(
     assert not (tmp_path / "run").exists()
 
 
-def test_train_takes_a_part_of_the_data(tmp_path: pathlib.Path) -> None:
+def test_train_takes_a_part_of_the_data(tmp_path):
     run = tmp_path / "run"
     arguments = ["--config=radenet", "--config.train.batch_size=8"]
     arguments += [f"--data={tmp_path}", f"--workdir={run}", "--sequences=1,58"]
@@ -81,7 +75,7 @@ def test_train_takes_a_part_of_the_data(tmp_path: pathlib.Path) -> None:
     assert config["data"]["weather"] == ["fog", "rain"]
 
 
-def test_fields_are_read_in_every_spelling() -> None:
+def test_fields_are_read_in_every_spelling():
     context = click.Context(train, **train.context_settings)
     words = ["--config=radenet", "--config.seed=1", "--config.seed=2", "--init-from=a"]
     train.parse_args(context, [*words, "--config.logging.wandb", "--weather=fog"])

@@ -13,7 +13,7 @@ from radejax.core.archives import (
 from radejax.core.errors import DataError
 
 
-def npy(array: np.ndarray) -> bytes:
+def npy(array):
     file = io.BytesIO()
     np.save(file, array)
     return file.getvalue()

@@ -14,7 +14,7 @@ from radejax.core import compilation_cache
 @pytest.fixture
 def values(monkeypatch):
     """Settings of JAX, of which the cache is not set."""
-    found: dict[str, object] = {"jax_compilation_cache_dir": None}
+    found = {"jax_compilation_cache_dir": None}
     config = SimpleNamespace(values=found, update=found.__setitem__)
     monkeypatch.setattr(jax, "config", config)
     return found

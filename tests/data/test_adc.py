@@ -1,6 +1,5 @@
 """From ADC samples to power: signs, sizes, aliasing, files and wrong input."""
 
-import pathlib
 import re
 
 import jax
@@ -154,11 +153,8 @@ def test_frames_can_be_batched():
 @pytest.mark.parametrize("is_interleaved", [True, False])
 @pytest.mark.parametrize("is_complex", [True, False])
 def test_files_of_all_layouts_are_read(
-    is_complex: bool,
-    is_interleaved: bool,
-    is_offset_binary: bool,
-    tmp_path: pathlib.Path,
-) -> None:
+    is_complex, is_interleaved, is_offset_binary, tmp_path
+):
     """Written word by word as TI's document lists them."""
     radar = RADAR.replace(num_chirps=2, num_samples=4, is_complex=is_complex)
     shape = (3, *radar.shape, 2 if is_complex else 1)

@@ -1,5 +1,3 @@
-from typing import Any
-
 import chex
 import jax
 import jax.numpy as jnp
@@ -165,7 +163,7 @@ def test_device_and_host_decode_alike(encoding):
     chex.assert_trees_all_close(found, decode(stored), rtol=1e-6, atol=0)
 
 
-def _image(kind: str) -> np.ndarray:
+def _image(kind):
     """One range-azimuth image of a single look in a unit."""
     power = np.random.default_rng(0).exponential(1e5, (64, 50, 2))
     power[20:24, 10:14] *= 1e4
@@ -189,7 +187,7 @@ def _image(kind: str) -> np.ndarray:
         ("steps", "db", 0.5),
     ],
 )
-def test_units_are_converted_to_power(kind: str, unit: Any, step: float) -> None:
+def test_units_are_converted_to_power(kind, unit, step):
     power = linear_power(_image(kind), unit, "a.npy", db_per_step=step)
     expected = _image("averaged_power" if kind == "averaged_power" else "power")
     assert power.dtype == np.float32
@@ -211,12 +209,12 @@ def test_units_are_converted_to_power(kind: str, unit: Any, step: float) -> None
         ),
     ],
 )
-def test_values_of_another_unit_are_refused(kind: str, unit: Any, message: str) -> None:
+def test_values_of_another_unit_are_refused(kind, unit, message):
     with pytest.raises(DataError, match=f"^a.npy, read as '{unit}': {message}"):
         linear_power(_image(kind), unit, "a.npy")
 
 
-def test_ranges_may_be_another_axis() -> None:
+def test_ranges_may_be_another_axis():
     values = _image("amplitude").swapaxes(0, 1)
     far = (
         values * np.geomspace(1e3, 1, 64)[None, :, None]

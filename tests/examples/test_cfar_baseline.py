@@ -1,7 +1,6 @@
 """The CFAR baseline from a dataset to its report."""
 
 import json
-import pathlib
 
 import cfar_baseline as module
 import pytest
@@ -13,7 +12,7 @@ from radejax.simulation.dataset import simulate_dataset
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+def data(tmp_path_factory):
     """A small dataset without images, with records."""
     root = tmp_path_factory.mktemp("data")
     size = {"train_sequences": 2, "test_sequences": 1, "frames_per_sequence": 4}

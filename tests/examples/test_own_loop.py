@@ -1,17 +1,11 @@
 """The training loop of the guide, as it is."""
 
-import pathlib
-
 import own_loop
 import pytest
 
 
 @pytest.mark.slow
-def test_the_loop_of_the_guide_trains(
-    tmp_path: pathlib.Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_loop_of_the_guide_trains(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     detector = own_loop.train(num_steps=31)
     losses = [

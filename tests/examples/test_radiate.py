@@ -18,7 +18,7 @@ CAMERA = {
 }  # fmt: skip
 
 
-def write_sequence(folder: pathlib.Path, num_frames: int) -> None:
+def write_sequence(folder, num_frames):
     """A car at 50 m to the right, in the layout of RADIATE."""
     for name in ("Navtech_Polar", "zed_left", "annotations"):
         (folder / name).mkdir(parents=True)
@@ -46,7 +46,7 @@ def write_sequence(folder: pathlib.Path, num_frames: int) -> None:
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory) -> pathlib.Path:
+def root(tmp_path_factory):
     root = tmp_path_factory.mktemp("radiate")
     write_sequence(root / "data" / "fog_1", 5)
     text = yaml.safe_dump({"left_cam_calib": CAMERA})

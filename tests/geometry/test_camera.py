@@ -19,7 +19,7 @@ from .. import small_models as small
 DISTORTION = (-0.028873818, 0.0006023302, 0.0039573087, -0.0050471763, 0.0)
 
 
-def forward_camera(**fields) -> CameraCalibration:
+def forward_camera(**fields):
     """100 x 80 pixels, focal length 50, looking along x from the LiDAR."""
     settings = {
         "intrinsics": (50.0, 50.0, 50.0, 40.0),

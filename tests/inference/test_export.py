@@ -6,7 +6,6 @@ import os
 import re
 import subprocess
 import sys
-from typing import Any
 
 import jax
 import numpy as np
@@ -408,7 +407,7 @@ def test_onnx_files_give_the_same_boxes(kind, tmp_path, monkeypatch):
     runtime = pytest.importorskip("onnxruntime")
     onnx = pytest.importorskip("onnx")
     detector, count = _calibrated(small.detector(kind)), 2
-    arguments: tuple[Any, ...] = (small.projections(count),)
+    arguments = (small.projections(count),)
     inputs = {"projection": arguments[0]}
     if kind == "camera":
         arguments, inputs = _camera_inputs(detector, count, embedded=True)

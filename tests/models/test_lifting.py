@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.geometry.camera import CameraCalibration, stack_cameras
+from radejax.geometry.camera import stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models import lifting
 from radejax.models.lifting import WeightingNetwork
@@ -19,7 +19,7 @@ AXES = QueryGridOptions(
 )
 
 
-def ahead(**fields) -> CameraCalibration:
+def ahead(**fields):
     """A camera of 100 x 80 pixels in the radar's place, looking along x."""
     settings = {"intrinsics": (50.0, 50.0, 50.0, 40.0), "width": 100, "height": 80}
     settings["radar_from_lidar_m"] = (0.0, 0.0, 0.0)

@@ -4,7 +4,6 @@ import pathlib
 import re
 import shutil
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
@@ -13,7 +12,7 @@ from radejax.config import Config
 from radejax.core.errors import UserError
 from radejax.data.kradar import KRadar
 from radejax.runs import data as run_data
-from radejax.runs.data import Data, data_of_run, located, open_data
+from radejax.runs.data import data_of_run, located, open_data
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
 
@@ -21,7 +20,7 @@ SMALL = SimulationOptions(train_sequences=2, test_sequences=1)
 
 
 @pytest.fixture(scope="module")
-def simulated(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+def simulated(tmp_path_factory):
     """Sequences 1 and 2 of the train split, 3 of the test split, of two frames."""
     simulation = SMALL.replace(output="projection", frames_per_sequence=2)
     root = tmp_path_factory.mktemp("simulated") / "sim"
@@ -29,11 +28,11 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
 
 
 @pytest.fixture
-def root(simulated: pathlib.Path, tmp_path: pathlib.Path) -> pathlib.Path:
+def root(simulated, tmp_path):
     return pathlib.Path(shutil.copytree(simulated, tmp_path / "sim"))
 
 
-def _config(*roots: object, batch_size: int = 1, **fields: Any) -> Config:
+def _config(*roots, batch_size=1, **fields):
     return Config().replace(
         model={"doppler_bins": 16, "elevation_bins": 9},
         train={"batch_size": batch_size},
@@ -41,16 +40,16 @@ def _config(*roots: object, batch_size: int = 1, **fields: Any) -> Config:
     )
 
 
-def _open(config: Config) -> Data:
+def _open(config):
     return open_data(located(config))
 
 
-def test_without_data_and_simulation_the_flag_is_named() -> None:
+def test_without_data_and_simulation_the_flag_is_named():
     with pytest.raises(UserError, match=r"give --data ROOT"):
         located(Config())
 
 
-def test_a_missing_folder_is_named(tmp_path: pathlib.Path) -> None:
+def test_a_missing_folder_is_named(tmp_path):
     nowhere = str(tmp_path / "nowhere")
     names = ("labels", "embeddings", "image_backbone", "camera_calibration")
     configs = [_config(tmp_path, **{name: nowhere}) for name in names]
@@ -60,8 +59,8 @@ def test_a_missing_folder_is_named(tmp_path: pathlib.Path) -> None:
 
 
 def test_paths_are_absolute_and_simulations_named_by_their_config(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "v2.zip").touch()
     config = _config(labels="v2.zip").replace(simulation=SimulationOptions())
@@ -75,12 +74,7 @@ def test_paths_are_absolute_and_simulations_named_by_their_config(
         located(config.replace(data={"roots": ("a", "b")}))
 
 
-def test_frames_are_projected_beside_their_data_once(
-    root: pathlib.Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_frames_are_projected_beside_their_data_once(root, monkeypatch, capsys, caplog):
     monkeypatch.chdir(root.parent)
     for wrong, message in (
         (
@@ -108,7 +102,7 @@ def test_frames_are_projected_beside_their_data_once(
     assert len(data.records.keys()) == 6
     assert len(data.split("test")) == 2
 
-    def written() -> dict[pathlib.Path, int]:
+    def written():
         return {p: p.stat().st_mtime_ns for p in (root / "records").rglob("*.npy")}
 
     before = written()
@@ -118,9 +112,7 @@ def test_frames_are_projected_beside_their_data_once(
     assert written() == before
 
 
-def test_frames_of_the_splits_without_labels_are_counted(
-    root: pathlib.Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_frames_of_the_splits_without_labels_are_counted(root, caplog):
     min(root.glob("1/info_label_v2_1/*")).unlink()
     shutil.rmtree(root / "3" / "info_label_v2_1")
     with caplog.at_level("INFO", "radejax"):
@@ -130,9 +122,7 @@ def test_frames_of_the_splits_without_labels_are_counted(
     assert "split entries of sequences that are not here: 2" in caplog.text
 
 
-def test_frames_without_a_radar_tensor_that_can_be_read_are_left_out(
-    root: pathlib.Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_frames_without_a_radar_tensor_that_can_be_read_are_left_out(root, caplog):
     corrupted = next(frame for frame in KRadar(root) if frame.sequence == 1)
     corrupted.projection_path.write_bytes(b"half")
     with caplog.at_level("WARNING", "radejax"):
@@ -145,15 +135,12 @@ def test_frames_without_a_radar_tensor_that_can_be_read_are_left_out(
 
 
 def test_a_run_is_evaluated_on_its_part_or_on_all_of_other_folders(
-    root: pathlib.Path,
-    tmp_path: pathlib.Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+    root, tmp_path, monkeypatch, caplog
+):
     frames, copy = KRadar(root), str(shutil.copytree(root, tmp_path / "copy"))
     given = str(tmp_path / "copy")  # any folder that exists
     own = located(_config(root, sequences=(1, 3), labels=given, embeddings=given))
-    saved: Any = SimpleNamespace(config=own, grid=frames.grid)
+    saved = SimpleNamespace(config=own, grid=frames.grid)
     saved.model = models.build(own.model)
     with monkeypatch.context() as patch:
         patch.setattr(run_data, "Data", lambda *_: SimpleNamespace(frames=frames))
@@ -176,9 +163,7 @@ def test_a_run_is_evaluated_on_its_part_or_on_all_of_other_folders(
         assert {frame.sequence for frame in found.frames} == expected
 
 
-def test_sequences_are_held_out_for_validation(
-    root: pathlib.Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_sequences_are_held_out_for_validation(root, caplog):
     with caplog.at_level("INFO", "radejax"):
         data = _open(_config(root, validation=(1,)))
     names = ("train", "validation", "test")

@@ -2,13 +2,10 @@
 
 import hashlib
 import json
-import pathlib
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
-from jax.sharding import Mesh
 
 from radejax.config import Config, load_config
 from radejax.core import devices
@@ -26,15 +23,12 @@ from .. import small_models as small
 
 
 def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
-    tmp_path: pathlib.Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-    one_device: Mesh,
-) -> None:
+    tmp_path, monkeypatch, caplog, one_device
+):
     caplog.set_level("INFO", logger="radejax")
     said_before = []
 
-    def fit(*args: Any, **__: Any) -> Any:
+    def fit(*args, **__):
         said_before.append(caplog.text)
         return SimpleNamespace(step=1), True
 
@@ -54,10 +48,8 @@ def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
     assert "radejax detect" in caplog.text
 
 
-def test_frames_labels_and_frozen_weights_tell_whether_a_run_is_the_same() -> None:
-    def stays(
-        keys: list[str], frozen: str | None = None, x: float = 1.0, cls: str = "Sedan"
-    ) -> dict:
+def test_frames_labels_and_frozen_weights_tell_whether_a_run_is_the_same():
+    def stays(keys, frozen=None, x=1.0, cls="Sedan"):
         box, classes = np.array([[x, 2, 3, 4, 2, 1.5, 0]]), np.array([cls])
         frames = [SimpleNamespace(key=key, boxes=box, classes=classes) for key in keys]
         return experiment._invariants(frames, frozen)
@@ -71,12 +63,7 @@ def test_frames_labels_and_frozen_weights_tell_whether_a_run_is_the_same() -> No
 
 
 @pytest.mark.slow
-def test_a_run_of_two_frames(
-    tmp_path: pathlib.Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-    one_device: Mesh,
-) -> None:
+def test_a_run_of_two_frames(tmp_path, monkeypatch, caplog, one_device):
     """Training, choice of a checkpoint on a held-out sequence, evaluation and detection.
 
     Labels are read once, and weights fit models of two frames only.
@@ -85,7 +72,7 @@ def test_a_run_of_two_frames(
     evaluated = []
     make = evaluate.tables_from_frames
 
-    def tables(frames: Any, *args: Any) -> Any:
+    def tables(frames, *args):
         evaluated.append([frame.sequence for frame in frames])
         return make(frames, *args)
 
@@ -143,9 +130,7 @@ def test_a_run_of_two_frames(
         experiment.run(one, tmp_path / "one", init_from=folder, mesh=one_device)
 
 
-def test_a_batch_that_does_not_divide_is_rejected_first(
-    tmp_path: pathlib.Path,
-) -> None:
+def test_a_batch_that_does_not_divide_is_rejected_first(tmp_path):
     config = load_config("quickstart").replace(train={"batch_size": 2})
     with pytest.raises(
         UserError, match=r"batch_size is 2, expected a multiple of 4 devices"
@@ -157,9 +142,7 @@ def test_a_batch_that_does_not_divide_is_rejected_first(
 # Work folders ------------------------------------------------------------------------
 
 
-def test_a_work_folder_keeps_its_config_and_rejects_another(
-    tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_work_folder_keeps_its_config_and_rejects_another(tmp_path, caplog):
     config = Config()
     # As long as nothing is trained, the folder takes another config.
     for kept in (config, config, config.replace(train={"num_epochs": 7})):
@@ -184,7 +167,7 @@ def test_a_work_folder_keeps_its_config_and_rejects_another(
     assert "config.logging.num_visualizations is 4 there and 1 here" in lines
 
 
-def test_a_second_training_in_a_work_folder_is_rejected(tmp_path: pathlib.Path) -> None:
+def test_a_second_training_in_a_work_folder_is_rejected(tmp_path):
     folder = tmp_path / "run"
     with (
         claimed(folder, Config()),
@@ -196,7 +179,7 @@ def test_a_second_training_in_a_work_folder_is_rejected(tmp_path: pathlib.Path) 
         pass
 
 
-def test_what_a_run_started_from_is_kept(tmp_path: pathlib.Path) -> None:
+def test_what_a_run_started_from_is_kept(tmp_path):
     info = experiment.run_info(tmp_path, str(tmp_path / "model.pth"))
     assert info["init_from"] == str(tmp_path / "model.pth")
     (tmp_path / "run.json").write_text(json.dumps(info))
@@ -204,7 +187,7 @@ def test_what_a_run_started_from_is_kept(tmp_path: pathlib.Path) -> None:
     assert again["init_from"] == info["init_from"]
 
 
-def test_a_run_with_checkpoints_takes_no_other_weights(tmp_path: pathlib.Path) -> None:
+def test_a_run_with_checkpoints_takes_no_other_weights(tmp_path):
     first = tmp_path / "a.pth"
     info = experiment.run_info(tmp_path, first)
     (tmp_path / "run.json").write_text(json.dumps(info))
@@ -219,11 +202,7 @@ def test_a_run_with_checkpoints_takes_no_other_weights(tmp_path: pathlib.Path) -
         experiment.run_info(tmp_path, first, first)
 
 
-def test_commit_and_own_parts_of_a_run_are_stored(
-    tmp_path: pathlib.Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_commit_and_own_parts_of_a_run_are_stored(tmp_path, monkeypatch, caplog):
     monkeypatch.chdir(tmp_path)
     own = tmp_path / "own_terms.py"
     own.write_text("def size(pairs, options):\n    return 0.0\n")
@@ -246,12 +225,12 @@ def test_commit_and_own_parts_of_a_run_are_stored(
 
 
 def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, monkeypatch
+):
     aps = {0: 50.0, 1: 53.0, 2: 59.0}
     seen = []
 
-    def run(config: Any, workdir: pathlib.Path, *, init_from: str) -> Any:
+    def run(config, workdir, *, init_from):
         seen.append((config.seed, workdir.name, init_from))
         (workdir / "evaluation").mkdir(parents=True)
         (workdir / "evaluation" / "metrics.csv").write_text(
@@ -284,16 +263,11 @@ def test_every_seed_runs_in_its_folder_and_the_spread_is_reported(
     ],
 )
 def test_only_an_unfinished_seed_ends_the_seeds_and_old_reports_do_not_count(
-    tmp_path: pathlib.Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-    is_finished: bool,
-    is_evaluated: bool,
-    expected: list[int],
-) -> None:
+    tmp_path, monkeypatch, caplog, is_finished, is_evaluated, expected
+):
     started = []
 
-    def run(config: Any, workdir: pathlib.Path) -> Any:
+    def run(config, workdir):
         started.append(config.seed)
         (workdir / "evaluation").mkdir(parents=True)
         num_gt = 0 if is_evaluated else 10

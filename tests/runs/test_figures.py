@@ -2,8 +2,6 @@
 
 import dataclasses
 import json
-import pathlib
-from typing import Any
 
 import click.testing
 import numpy as np
@@ -23,15 +21,12 @@ from radejax.runs.figures import draw_training_samples
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
 from radejax.visualize.draw import draw_scenes
-from radejax.visualize.style import Scene
 
 from .. import small_models as small
 
 
-def test_samples_are_drawn_with_their_augmentation(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    drawn: list[Any] = []
+def test_samples_are_drawn_with_their_augmentation(tmp_path, monkeypatch):
+    drawn = []
     monkeypatch.setattr(
         figures, "draw_samples", lambda rows, grid: drawn.append((rows, grid))
     )
@@ -51,7 +46,7 @@ def test_samples_are_drawn_with_their_augmentation(
     assert len(titles) == 8
 
 
-def test_bins_out_of_view_and_frames_without_image_do_not_count() -> None:
+def test_bins_out_of_view_and_frames_without_image_do_not_count():
     grid = RadarGrid.reduced(
         num_doppler=2, num_range=2, num_elevation=2, num_azimuth=2, max_range_m=20.0
     )
@@ -69,7 +64,7 @@ def test_bins_out_of_view_and_frames_without_image_do_not_count() -> None:
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+def root(tmp_path_factory):
     """Two simulated sequences of one frame."""
     options = SimulationOptions(
         train_sequences=0,
@@ -81,7 +76,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
     return simulate_dataset(options, folder, progress=False)
 
 
-def test_scenes_show_which_boxes_match(root: pathlib.Path) -> None:
+def test_scenes_show_which_boxes_match(root):
     frames = KRadar([root])
     frame = frames[0]
     box = np.array([[10.0, 0, 0, 4, 2, 1.5, 0], [30, 0, 0, 4, 2, 1.5, 0]])
@@ -104,12 +99,7 @@ def test_scenes_show_which_boxes_match(root: pathlib.Path) -> None:
     assert scene.matches.ground_truth.tolist() == [0, 0, 0]
 
 
-def test_compared_runs_are_drawn_side_by_side(
-    root: pathlib.Path,
-    tmp_path: pathlib.Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_compared_runs_are_drawn_side_by_side(root, tmp_path, monkeypatch, caplog):
     frames = KRadar([root])
     rows = [
         {"frame": frame.key, "cls": str(cls), "box": box.tolist(), "score": 0.5}
@@ -119,7 +109,7 @@ def test_compared_runs_are_drawn_side_by_side(
     paths = tmp_path / "all.json", tmp_path / "few.json"
     paths[0].write_text(json.dumps(rows))
     paths[1].write_text(json.dumps(rows[::2]))
-    drawn: list[list[Scene]] = []
+    drawn = []
     monkeypatch.setattr(
         figures, "draw_scenes", lambda x: drawn.append(x) or draw_scenes(x)
     )
@@ -140,9 +130,7 @@ def test_compared_runs_are_drawn_side_by_side(
         assert (one.matches.ground_truth != 0).all()  # all is found
 
 
-def test_a_run_with_other_frame_ids_is_drawn_with_its_own(
-    root: pathlib.Path, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_with_other_frame_ids_is_drawn_with_its_own(root, tmp_path, monkeypatch):
     frames = list(KRadar([root]))
     options = ReportOptions(roi=None, plots=False, protocols=("all_point",))
     paths = tmp_path / "all", tmp_path / "part"
@@ -150,7 +138,7 @@ def test_a_run_with_other_frame_ids_is_drawn_with_its_own(
         truth, table = tables_from_frames(chosen)
         found = dataclasses.replace(truth, score=np.full(len(truth), 0.9))
         write_report(truth, found, table, path, options)
-    drawn: list[list[Scene]] = []
+    drawn = []
     monkeypatch.setattr(figures, "draw_scenes", drawn.append)
     monkeypatch.setattr(figures, "save_figure", lambda *_: None)
     source = Source(data=(str(root),), sequences=(frames[1].sequence,))

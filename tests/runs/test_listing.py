@@ -1,7 +1,6 @@
 """The table of runs: what differs, APs and minutes."""
 
 import json
-import pathlib
 
 from click.testing import CliRunner
 
@@ -9,7 +8,7 @@ from radejax.cli.evaluate import runs
 from radejax.config import Config
 
 
-def _write(folder: pathlib.Path, config: Config, minutes: list[float]) -> pathlib.Path:
+def _write(folder, config, minutes):
     folder.mkdir(parents=True)
     (folder / "config.json").write_text(json.dumps(config.without_data_paths()))
     start = {"init_from": None, "init_partial": f"/runs/{folder.name}"}
@@ -19,7 +18,7 @@ def _write(folder: pathlib.Path, config: Config, minutes: list[float]) -> pathli
     return folder
 
 
-def _report(folder: pathlib.Path, ap: float) -> None:
+def _report(folder, ap):
     names = [f"mean/all/ap_{space}_iou30/p/roi=narrow" for space in ("bev", "3d")]
     rows = [{"name": name, "ap": x} for name, x in zip(names, (99.0, ap), strict=True)]
     content = {"ap": rows, "options": {"protocols": ["p"]}, "split": "test"}
@@ -27,7 +26,7 @@ def _report(folder: pathlib.Path, ap: float) -> None:
     (folder / "evaluation" / "metrics.json").write_text(json.dumps(content))
 
 
-def test_runs_are_listed_with_what_differs(tmp_path: pathlib.Path) -> None:
+def test_runs_are_listed_with_what_differs(tmp_path):
     config = Config()
     _report(_write(tmp_path / "a", config, [0.5, 1.0]), 41.5)
     changed = config.replace(seed=1, loss={"weights": {"focal": 4.0, "gwd": 1.0}})
@@ -53,7 +52,7 @@ def test_runs_are_listed_with_what_differs(tmp_path: pathlib.Path) -> None:
     assert "seed=1, loss.weights.focal=4.0" in table
 
 
-def test_a_folder_without_runs_is_wrong_use(tmp_path: pathlib.Path) -> None:
+def test_a_folder_without_runs_is_wrong_use(tmp_path):
     done = CliRunner().invoke(runs, [str(tmp_path)])
     assert done.exit_code == 2
     assert "no run in" in done.stderr

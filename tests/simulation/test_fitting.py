@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import pathlib
 
 import numpy as np
 import pytest
@@ -112,7 +111,7 @@ SMALL = {"image_width": 0, "image_height": 0, "frames_per_sequence": 1}
 
 
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory) -> pathlib.Path:
+def recorded(tmp_path_factory):
     """Three frames of the realistic sensor."""
     options = SimulationOptions(**SMALL, train_sequences=3, test_sequences=0)
     return simulate_dataset(options, tmp_path_factory.mktemp("a") / "b", progress=False)

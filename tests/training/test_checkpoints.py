@@ -7,8 +7,6 @@ import pathlib
 import random
 import shutil
 import subprocess
-from collections.abc import Iterator
-from typing import Any
 
 import grain
 import jax
@@ -37,12 +35,12 @@ def what_orbax_left_is_collected():
     gc.collect()
 
 
-def _iterator() -> Any:
+def _iterator():
     dataset = grain.MapDataset.range(1000).repeat(None)
     return iter(dataset.to_iter_dataset(grain.ReadOptions(num_threads=0)))
 
 
-def _state(step: int) -> dict[str, Any]:
+def _state(step):
     return {
         "params": {"w": jnp.asarray(WEIGHTS * step)},
         "opt_state": [{"w": jnp.asarray(-WEIGHTS * step)}],
@@ -51,7 +49,7 @@ def _state(step: int) -> dict[str, Any]:
     }
 
 
-def _abstract(state: Any = None) -> Any:
+def _abstract(state=None):
     whole = devices.replicated(devices.make_mesh(1))
     state = _state(0) if state is None else state
     return jax.tree.map(
@@ -59,12 +57,12 @@ def _abstract(state: Any = None) -> Any:
     )
 
 
-def _restored_step(folder: pathlib.Path) -> int:
+def _restored_step(folder):
     with Checkpoints(folder, max_to_keep=None) as checkpoints:
         return checkpoints.restore(_abstract(), _iterator())[2]
 
 
-def _read(folder: pathlib.Path, step: int | None = None) -> tuple[Any, dict, int]:
+def _read(folder, step=None):
     with Checkpoints(folder, read_only=True) as checkpoints:
         return checkpoints.restore_variables(step)
 
@@ -164,13 +162,13 @@ def test_a_full_disk_is_one_clear_error_and_earlier_checkpoints_stay(small_disk)
     # Random bits do not compress: 1 MiB a checkpoint.
     values = np.random.default_rng(0).random((8, 2**15), np.float32)
 
-    def state(step: int) -> dict[str, jax.Array]:
+    def state(step):
         return {"w": jnp.asarray(values * step), "step": jnp.int32(step)}
 
     iterator, folder = _iterator(), small_disk / "checkpoints"
     checkpoints = Checkpoints(folder, max_to_keep=None)
 
-    def fill() -> None:
+    def fill():
         for step in range(1, 99):
             checkpoints.save(step, state(step), iterator, info={})
             checkpoints.wait()
@@ -197,7 +195,7 @@ def tiny(tmp_path):
     return tmp_path / "checkpoints"
 
 
-def _bits(folder: pathlib.Path) -> Iterator[tuple[pathlib.Path, int]]:
+def _bits(folder):
     """All bits of the headers, and a thousand of the rest.
 
     Headers are what describes the arrays, the position, the configuration and the

@@ -2,9 +2,7 @@
 
 import itertools
 import json
-from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any
 
 import jax.numpy as jnp
 import pytest
@@ -15,19 +13,19 @@ from radejax.training import hooks, loop
 from radejax.training.metric_writer import MetricWriter
 
 
-def _step(state: Any, batch: int) -> tuple[Any, Any]:
+def _step(state, batch):
     after = SimpleNamespace(step=state.step + 1, seen=[*state.seen, batch])
     return after, {"loss": jnp.float32(batch)}
 
 
 def test_hooks_are_called_in_order_after_each_step():
-    calls: list[Any] = []
+    calls = []
 
-    def named(name: str) -> hooks.Hook:
+    def named(name):
         return lambda step, state, metrics: calls.append((name, step, state.seen[-1]))
 
     called = [named("a"), hooks.every(5, 2, named("b")), hooks.every(5, 0, named("c"))]
-    state: Any = SimpleNamespace(step=1, seen=[])
+    state = SimpleNamespace(step=1, seen=[])
     state = loop.train(state, _step, itertools.count(7), called, num_steps=5)
     assert (state.step, state.seen) == (5, [7, 8, 9, 10])
     a, b = ([c[1:] for c in calls if c[0] == name] for name in "ab")
@@ -37,14 +35,14 @@ def test_hooks_are_called_in_order_after_each_step():
 
 
 def test_the_loop_stops_between_steps_of_which_two_are_under_way(monkeypatch):
-    waited_for: list[float] = []
+    waited_for = []
     monkeypatch.setattr(
         loop.jax,
         "block_until_ready",
         lambda metrics: waited_for.append(float(metrics["loss"])),
     )
     answers = iter([False] * 5 + [True])
-    state: Any = SimpleNamespace(step=0, seen=[])
+    state = SimpleNamespace(step=0, seen=[])
     state = loop.train(
         state,
         _step,
@@ -58,7 +56,7 @@ def test_the_loop_stops_between_steps_of_which_two_are_under_way(monkeypatch):
 
 
 def test_values_that_an_own_hook_returns_are_logged(tmp_path):
-    def own(step: int, *_: Any) -> Any:
+    def own(step, *_):
         return {3: {"norm": 2.5}, 4: "text"}.get(step)
 
     with MetricWriter(tmp_path, Config(), 0) as writer:
@@ -77,7 +75,7 @@ def wait(monkeypatch):
     """Function that sets the hooks' clock forward, which moves by 1 ns per look at it."""
     now = 0.0
 
-    def go_on(seconds: float = 1e-9) -> float:
+    def go_on(seconds=1e-9):
         nonlocal now
         now += seconds
         return now
@@ -86,7 +84,7 @@ def wait(monkeypatch):
     return go_on
 
 
-def _batches(wait: Callable[[float], float], *seconds: float) -> Any:
+def _batches(wait, *seconds):
     """Batches that take some seconds to read."""
     return (SimpleNamespace(frame=wait(x)) for x in seconds)
 
@@ -97,7 +95,7 @@ def test_waiting_for_data_is_warned_of_once(wait, tmp_path, monkeypatch, caplog)
     throughput = hooks.Throughput(_batches(wait, 0.0, 0.2, 0.2), 0)
     bar = hooks.ProgressBar(0, 10)
     with MetricWriter(tmp_path, config, 0) as writer:
-        log: Any = hooks.Log(config, 10, throughput, writer, bar)
+        log = hooks.Log(config, 10, throughput, writer, bar)
         for step in (1, 2, 3):
             next(throughput)
             wait(0.1)  # training

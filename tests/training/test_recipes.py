@@ -1,14 +1,12 @@
 """The configs of both papers: what they say, and two steps of each at tiny size."""
 
-from typing import Any
-
 import chex
 import jax
 import numpy as np
 import pytest
 
 from radejax import models
-from radejax.config import Config, load_config
+from radejax.config import load_config
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.options import DinoRadeOptions
 from radejax.training.step import (
@@ -89,11 +87,11 @@ def test_a_word_changes_only_its_fields(preset, word, changed):
         assert (after["model.input_scale"], after["data.release"]) == (25.0, word)
 
 
-def _shrink(config: Config) -> Config:
+def _shrink(config):
     """The same choices on a sensor of 8 x 8 bins."""
     model = config.model
     is_wide = model.decoder_width > model.widths[0] and model.heads != "default"
-    changes: dict[str, Any] = {
+    changes = {
         "doppler_bins": 5,
         "elevation_bins": 4,
         "widths": (8, 8),

@@ -1,7 +1,5 @@
 """Schedule and optimizer against numbers worked out by hand and torch's AdamW rule."""
 
-from typing import Any
-
 import chex
 import flax.linen as nn
 import jax
@@ -23,7 +21,7 @@ from radejax.training.step import (
 )
 
 
-def _schedule(steps_per_epoch: int, num_epochs: int = 1, **fields: Any) -> Any:
+def _schedule(steps_per_epoch, num_epochs=1, **fields):
     rates = {"learning_rate": 1e-3, "final_learning_rate": 1e-4, "schedule": "cosine"}
     train = TrainOptions(
         **rates | {"warmup_steps": 0, "num_epochs": num_epochs} | fields
@@ -56,7 +54,7 @@ def test_rates_by_step(schedule, steps, rates):
     np.testing.assert_allclose([float(schedule(x)) for x in steps], rates, rtol=1e-5)
 
 
-def _torch_recursion(peak: float, floor: float, period: int, steps: int) -> np.ndarray:
+def _torch_recursion(peak, floor, period, steps):
     """`CosineAnnealingLR.get_lr` of torch, stepped `steps` times, in float64."""
     rates = [peak]
     for epoch in range(1, steps):
@@ -106,7 +104,7 @@ def test_first_step_is_adamw_with_torch_defaults():
     grads = {"kernel": jnp.array([0.1, 4.0]), "bias": jnp.array([-1.0])}
     updates, _ = optimizer.update(grads, optimizer.init(params), params)
 
-    def expected(p: np.ndarray, g: np.ndarray) -> np.ndarray:
+    def expected(p, g):
         # Bias-corrected moments of one step are g and g^2; decay is on every parameter.
         return -1e-3 * (g / (np.abs(g) + 1e-8) + 0.01 * p)
 
@@ -161,7 +159,7 @@ def test_patterns_are_of_parameters_or_of_whole_parts():
 PARAMS = {"backbone": {"w": 1}, "image": {"w": 3}}
 
 
-def _schedule_of(name: str) -> Any:
+def _schedule_of(name):
     return make_schedule(TrainOptions(num_epochs=1, schedule=name), 5)
 
 

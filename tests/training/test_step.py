@@ -33,7 +33,7 @@ def step(tiny, start):
     return jax.jit(make_train_step(tiny.model, start[0], tiny.map_grid, **options))
 
 
-def _batch(tiny: Tiny, count: int = 4) -> Any:
+def _batch(tiny, count=4):
     return jax.tree.map(lambda x: x[:count], tiny.frames)
 
 

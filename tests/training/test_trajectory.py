@@ -7,24 +7,21 @@ float32 sums alone does to the authors' code there.
 
 import json
 import zlib
-from collections.abc import Callable, Mapping
-from typing import Any
 
 import jax
 import numpy as np
 import pytest
 
 from radejax import models
-from radejax.config import Config, load_config
+from radejax.config import load_config
 from radejax.core import devices
-from radejax.core.structures import Batch, DetectionMaps
+from radejax.core.structures import Batch
 from radejax.geometry.boxes import boxes8_from_7
 from radejax.geometry.camera import stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.saved import load_torch
 from radejax.models.vit import ViT
 from radejax.training.step import (
-    TrainState,
     create_state,
     make_optimizer,
     make_schedule,
@@ -42,17 +39,17 @@ Measured = dict[str, np.ndarray]
 
 
 @pytest.fixture(scope="module")
-def file(golden) -> Measured:
+def file(golden):
     return dict(np.load(golden / "trajectory.npz"))
 
 
-def of_training(file: Measured, kind: str) -> Measured:
+def of_training(file, kind):
     """The arrays of one of the two trainings."""
     prefix = f"{kind}/"
     return {k.removeprefix(prefix): v for k, v in file.items() if k.startswith(prefix)}
 
 
-def cube_of(frame: int, boxes: np.ndarray, classes: np.ndarray) -> np.ndarray:
+def cube_of(frame, boxes, classes):
     """The cube `[101, 256, 107]` in which each object is a spot with channels of its class."""
     rng = np.random.default_rng([SEED, 950 + frame])
     cube = 0.45 + 0.1 * rng.random((101, 256, 107), dtype=np.float32)
@@ -69,7 +66,7 @@ def cube_of(frame: int, boxes: np.ndarray, classes: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def frames(file) -> Batch:
+def frames(file):
     """The six frames, float32 as the authors' network sees them."""
     boxes, classes = file["boxes"], file["classes"].astype(np.int32)
     cubes = np.stack(
@@ -86,9 +83,7 @@ def frames(file) -> Batch:
     )
 
 
-def train(
-    config: Config, model: Any, variables: Any, batch: Batch, num_steps: int
-) -> tuple[TrainState, Measured]:
+def train(config, model, variables, batch, num_steps):
     """State after batches of two in order, and what each step measured."""
     num_epochs = -(-num_steps // STEPS_PER_EPOCH)
     options = config.train.replace(batch_size=2, num_epochs=num_epochs)
@@ -120,9 +115,7 @@ def train(
     }
 
 
-def check_steps(
-    measured: Measured, fixture: Mapping[str, np.ndarray], limits: np.ndarray
-) -> None:
+def check_steps(measured, fixture, limits):
     """Rates are float32's of the recorded ones, losses within relative limits."""
     np.testing.assert_allclose(measured["lr"], fixture["lr"], rtol=1.2e-7)
     for name in LOSSES:
@@ -132,13 +125,7 @@ def check_steps(
         assert (found < limit).all(), (name, found)
 
 
-def check_maps(
-    maps: DetectionMaps,
-    fixture: Mapping[str, np.ndarray],
-    *,
-    heatmap: float,
-    regression: float,
-) -> None:
+def check_maps(maps, fixture, *, heatmap, regression):
     """Maps of the first frame at the end, every 16th row and 8th column."""
     for name, limit, found in (
         ("heatmap", heatmap, jax.nn.sigmoid(maps.heatmap_logits)),
@@ -148,11 +135,7 @@ def check_maps(
         np.testing.assert_allclose(found, fixture[name], atol=limit, rtol=0)
 
 
-def check_stats(
-    tensors: Mapping[str, np.ndarray],
-    fixture: Mapping[str, np.ndarray],
-    limits: tuple[float, float, float],
-) -> None:
+def check_stats(tensors, fixture, limits):
     """Mean, standard deviation and largest magnitude of tensors at the end."""
     of_name = dict(zip(map(str, fixture["names"]), fixture["stats"], strict=True))
     for name, value in tensors.items():
@@ -182,11 +165,7 @@ def test_radenet_trains_as_released(file, frames, make):
     check_stats(trained, fixture, (2e-5, 2e-5, 1.5e-4))
 
 
-def by_torch_name(
-    load: Callable[[Mapping[str, np.ndarray]], Any],
-    tensors: Mapping[str, np.ndarray],
-    variables: Any,
-) -> dict[str, np.ndarray]:
+def by_torch_name(load, tensors, variables):
     """The numbers of every tensor that a loader puts into variables, in no order.
 
     Told by loading tensors of their own positions.
@@ -205,7 +184,7 @@ def by_torch_name(
     return {name: part for name, part in parts.items() if part.size}
 
 
-def images(fixture: Mapping[str, np.ndarray], model: Any, variables: Any) -> np.ndarray:
+def images(fixture, model, variables):
     """The six frames' images as the frozen backbone sees them."""
     embed = jax.jit(lambda image: model.apply(variables, image, method="embed"))
     features = []

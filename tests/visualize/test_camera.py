@@ -24,7 +24,7 @@ BEHIND = [-12.0, *BOX[1:]]
 FAR = [60.0, *BOX[1:]]  # 2 of 72 pixels high
 
 
-def segments_of(ax) -> np.ndarray:
+def segments_of(ax):
     lines = [c for c in ax.collections if hasattr(c, "get_segments")]
     return np.array(lines[-1].get_segments())
 

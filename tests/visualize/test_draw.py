@@ -21,14 +21,14 @@ GRID = RadarGrid.reduced(num_doppler=4, num_range=60, num_elevation=3, num_azimu
 ROI = (0.0, 72.0, -16.0, 16.0, -2.0, 7.6)
 
 
-def scene(range_idx: int = 20, azimuth_idx: int = 20, **fields) -> Scene:
+def scene(range_idx=20, azimuth_idx=20, **fields):
     """Scene with one echo."""
     projection = np.full(GRID.projection_shape, 0.2, np.float32)
     projection[range_idx, azimuth_idx, 2] = 0.6
     return Scene(projection, GRID, **fields)
 
 
-def brightest_tile(figure, ax) -> np.ndarray:
+def brightest_tile(figure, ax):
     """Center, in display coordinates, of the pixels in the strongest color."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
@@ -211,7 +211,7 @@ PROJECTION = (
 SLICED = Scene(PROJECTION, SMALL)
 
 
-def planes(figure) -> list[np.ndarray]:
+def planes(figure):
     return [ax.findobj(QuadMesh)[0].get_array() for ax in figure.axes[:3]]
 
 

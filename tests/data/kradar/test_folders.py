@@ -1,6 +1,5 @@
 import csv
 import dataclasses
-import pathlib
 import zipfile
 
 import pytest
@@ -29,7 +28,7 @@ def open_sequence(root, number=1, **options):
     return KRadar(root, **options)
 
 
-def touch(path: pathlib.Path, text: str = "x") -> pathlib.Path:
+def touch(path, text="x"):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
     return path

@@ -59,7 +59,7 @@ METAL = propagation.Surface(-1e12j, 0.0)
 EVEN = propagation.Surface(4.0, 0.0)
 
 
-def _reflection(sine: float, surface: propagation.Surface) -> complex:
+def _reflection(sine, surface):
     return propagation.reflection(np.array([sine]), surface, WAVELENGTH)[0]
 
 

@@ -30,7 +30,7 @@ ROWS = [
 ]
 
 
-def write(folder: pathlib.Path, lines: list[str]) -> pathlib.Path:
+def write(folder, lines):
     path = folder / "scenes.csv"
     path.write_text("\n".join(lines) + "\n")
     return path
