@@ -144,10 +144,7 @@ def test_other_user_errors(tmp_path):
         (lambda: load_config("radenet:big"), r"unknown config option 'big'; available"),
         (lambda: load_config(f"{mine}:word"), r"mine\.py has no function get_config"),
         (lambda: load_config(f"{tmp_path}/radenet"), r"a \.py file.*mean radenet\?"),
-        (
-            lambda: with_texts(plain, {"train.batchsize": "1"}),
-            "config.train.batch_size?",
-        ),
+        (lambda: with_texts(plain, {"train.batchsize": "1"}), "train.batch_size?"),
         (lambda: with_texts(plain, {"train.batch_size": "2.5"}), "is 2.5, expected"),
         (
             lambda: with_texts(plain, {"train.learning_rate": "((((" * 300}),

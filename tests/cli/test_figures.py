@@ -61,10 +61,7 @@ def test_frames_have_several_names(root, drawn):
         (("",), "expected sequence/radar_lidar"),
         (("1/00000_00000",), "no frame 00000_00000 in sequence 1; there are"),
         (("7",), "of sequences [7]; there are [1]"),
-        (
-            ("", "--sequences", 1, "--weather", other),
-            "no frames of these sequences and",
-        ),
+        (("", "--sequences", 1, "--weather", other), "no frames of these sequences"),
     ):
         assert message in _run(words[0], root, *words[1:], code=2).output
 

@@ -182,9 +182,7 @@ def test_files_of_all_layouts_are_read(
         found = read_ti_bin(path, frame, radar, **layout)
         assert found.dtype == (np.complex64 if is_complex else np.float32)
         np.testing.assert_array_equal(found, expected)
-    with pytest.raises(
-        DataError, match=r"adc_data.bin has 3 frames of .* above 3: check"
-    ):
+    with pytest.raises(DataError, match=r"adc_data.bin has 3 frames of .* above 3:"):
         read_ti_bin(path, 3, radar, **layout)
     with pytest.raises(DataError, match=r"adc_data.bin has 2.66667 frames"):
         read_ti_bin(
@@ -204,18 +202,12 @@ def test_files_of_all_layouts_are_read(
             {"azimuth_rad": np.arange(-50.0, 51.0)},
             "azimuth_rad must be finite, to 3.14159 radians .* got values from -50 to 50",
         ),
-        (
-            {"carrier_hz": 77.0},
-            "radar.carrier_hz is 77.0, expected a number of at least 1000000000",
-        ),
+        ({"carrier_hz": 77.0}, "carrier_hz is 77.0, expected a number of at least"),
         (
             {"slope_hz_per_s": 30.0},
             "radar.slope_hz_per_s is 30.0, expected Hz per second .30 MHz/us are 30e12",
         ),
-        (
-            {"sample_rate_hz": 10_000.0},
-            "radar.sample_rate_hz is 10000.0, expected at least 3.2e",
-        ),
+        ({"sample_rate_hz": 10_000.0}, "_rate_hz is 10000.0, expected at least 3.2e"),
     ],
 )
 def test_wrong_radars_are_named(change, message):

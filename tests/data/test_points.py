@@ -85,9 +85,7 @@ def test_the_strongest_bins_are_chosen_by_the_rate():
     with pytest.raises(UserError, match=r"rate is 1\.0, expected"):
         percentile_points(projection, GRID, 1.0)
     for method in (cfar_points, percentile_points):
-        with pytest.raises(
-            UserError, match=r"shape of the projection is .8, 64, 5, 56"
-        ):
+        with pytest.raises(UserError, match=r"shape of the projection is .8, 64, 5,"):
             method(power, GRID)
 
 

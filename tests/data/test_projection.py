@@ -126,9 +126,7 @@ def test_jax_on_one_frame_and_on_batches():
     [np.ones((2, 3, 4)), np.ones((2, 0, 3, 4)), np.ones(SHAPE, complex), "text"],
 )
 def test_what_is_no_tesseract(tesseract):
-    with pytest.raises(
-        UserError, match=r"a tesseract is a real array \[Doppler, range"
-    ):
+    with pytest.raises(UserError, match=r"a tesseract is a real array \[Doppler,"):
         project_tensor(tesseract)
 
 
@@ -197,16 +195,8 @@ def test_units_are_converted_to_power(kind, unit, step):
 @pytest.mark.parametrize(
     ("kind", "unit", "message"),
     [
-        (
-            "amplitude",
-            "power",
-            r"noise rises by [34]\.\d dB .* as if values were 'amplitude'",
-        ),
-        (
-            "power",
-            "amplitude",
-            r"noise rises by 1[56]\.\d dB .* as if values were 'power'",
-        ),
+        ("amplitude", "power", r"by [34]\.\d dB .* as if values were 'amplitude'"),
+        ("power", "amplitude", r"by 1[56]\.\d dB .* as if values were 'power'"),
     ],
 )
 def test_values_of_another_unit_are_refused(kind, unit, message):

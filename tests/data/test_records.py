@@ -111,9 +111,7 @@ def test_corrupted_descriptions_are_named(copy, change, message):
     with pytest.raises(DataError, match="is not valid JSON"):
         open_projections(copy)
     path.unlink()
-    with pytest.raises(
-        FileNotFoundError, match=r"no manifest\.json; expected a folder"
-    ):
+    with pytest.raises(FileNotFoundError, match=r"no manifest\.json; expected a"):
         open_projections(copy)
 
 
@@ -217,9 +215,7 @@ def test_bad_frames_are_skipped_counted_and_tried_again(root, tmp_path):
     assert list(report.skipped) == ["1/00005_00002", "2/00009_00006"]
     assert "skipped 2/00009_00006: no radar tensor in any root" in report.to_text()
     assert "skipped 1/00005_00002: " in report.to_text()
-    with pytest.raises(
-        UserError, match=r"2 of 12 .* is 1/00005_00002: run `radejax pr"
-    ):
+    with pytest.raises(UserError, match=r"2 of 12 .* is 1/00005_00002: run `radejax"):
         open_projections(out).require(data)
     bad.write_bytes(content)
     report = run(data, out)
@@ -278,9 +274,7 @@ def test_a_folder_has_records_of_one_kind(data, tmp_path):
     records = open_projections(tmp_path)
     exact = project_file(data[0].tesseract_path)
     assert np.abs(records[data[0].key] / 255 - exact).max() <= 0.5001 / 255
-    with pytest.raises(
-        UserError, match=r"other records: options\.dtype is 'uint8' there"
-    ):
+    with pytest.raises(UserError, match=r"other records: options\.dtype is 'uint8'"):
         run(data, tmp_path, dtype="float16")
     with pytest.raises(UserError, match=r"options\.source\.grid\.azimuth_rad differs"):
         run(LabeledFrames(data, RadarGrid.kradar()), tmp_path)

@@ -218,18 +218,9 @@ def test_an_image_that_cannot_be_read_fails_alone(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (
-            "threshold",
-            r"decode\.score_threshold is 0\.1 there and 0\.3 here; choose anot",
-        ),
-        (
-            "weights",
-            r"options\.weights is '\w{16}' there and '\w{16}' here; choose anot",
-        ),
-        (
-            "frames",
-            r"options\.frames is \['7/00000', .* there and \['7/00000'\] here; ch",
-        ),
+        ("threshold", r"decode\.score_threshold is 0\.1 there and 0\.3 here; choose"),
+        ("weights", r"options\.weights is '\w{16}' there and '\w{16}' here; choose"),
+        ("frames", r"options\.frames is \['7/00000', .* there and \['7/00000'\] here;"),
         ("format", r"options\.format is 'json' there and 'kitti' here"),
         ("manifest", r"7_0000\d\.json is there, but no manifest\.json"),
     ],
@@ -310,9 +301,7 @@ def test_frames_that_failed_are_left_out_and_counted(detected, tmp_path, kind):
     assert counts == {"frames left out: `radejax detect` failed": 1}
     assert frames["frame"].tolist() == truth.frame.tolist() == [0, 2]
     assert len(left) == np.count_nonzero(found.frame != 1) < len(found)
-    with pytest.raises(
-        DataError, match="1 of 4 frames have no file, such as 7/00003_0"
-    ):
+    with pytest.raises(DataError, match="1 of 4 frames have no file, such as 7/00003_"):
         _score(detector, out, 4)
 
 
@@ -411,9 +400,7 @@ def test_images_of_simulated_folders_are_found(tmp_path):
 
     # K-Radar's disks have no camera calibration; its repository does.
     folder = (root / "calib").rename(tmp_path / "repository")
-    with pytest.raises(
-        UserError, match=r"1 no camera calib.*--camera-calibration FOLD"
-    ):
+    with pytest.raises(UserError, match=r"1 no camera calib.*--camera-calibration"):
         front_images([path], detector)
     known = front_images([path], detector, camera_calibration=folder)
     np.testing.assert_array_equal(known[found][1].intrinsics, camera.intrinsics)

@@ -101,9 +101,7 @@ def test_matching_weights_are_those_of_equal_name_and_shape(
     assert "another radar" not in caplog.text
     stranger = dataclasses.replace(saved, variables={"params": {"other": np.zeros(1)}})
     monkeypatch.setattr(saved_models, "load_model", lambda path: stranger)
-    with pytest.raises(
-        UserError, match=r"--init-partial is .* a model with some equal"
-    ):
+    with pytest.raises(UserError, match=r"--init-partial is .* a model with some"):
         matching_weights(tmp_path, saved.model)
 
 
@@ -195,9 +193,7 @@ def test_another_backbone_than_that_of_the_training_is_rejected(tmp_path, monkey
             load_model(folder, image_backbone="other")
     config = saved.config.replace(model={"image": {"freeze": False}})
     save_model(dataclasses.replace(saved, config=config), tuned, with_backbone=True)
-    with pytest.raises(
-        UserError, match="own, but the model has a fine-tuned image back"
-    ):
+    with pytest.raises(UserError, match="own, but the model has a fine-tuned image"):
         load_model(tuned, image_backbone="own")
 
 
@@ -288,9 +284,7 @@ def test_the_thresholds_of_the_validation_split_are_exported(tmp_path, caplog):
     model = dataclasses.replace(small.detector().saved, step=7, identity={"run": "a"})
     _evaluation(run, "evaluation_a", 3, "the validation split", {"Sedan": 0.7})
     _evaluation(run, "evaluation", 7, None, {})
-    with pytest.raises(
-        UserError, match="no evaluation of step 7 chose score thresholds"
-    ):
+    with pytest.raises(UserError, match="no evaluation of step 7 chose"):
         saved_models.with_chosen_thresholds(model, run, "best_f1")
     _evaluation(
         run, "evaluation_b", 7, "the evaluated frames themselves", {"Sedan": 0.6}

@@ -132,9 +132,7 @@ def test_a_run_of_two_frames(tmp_path, monkeypatch, caplog, one_device):
 
 def test_a_batch_that_does_not_divide_is_rejected_first(tmp_path):
     config = load_config("quickstart").replace(train={"batch_size": 2})
-    with pytest.raises(
-        UserError, match=r"batch_size is 2, expected a multiple of 4 devices"
-    ):
+    with pytest.raises(UserError, match=r"batch_size is 2, expected a multiple of 4"):
         experiment.run(config, tmp_path / "run", mesh=devices.make_mesh(4))
     assert not list(tmp_path.iterdir())
 

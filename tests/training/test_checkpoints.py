@@ -248,9 +248,7 @@ def test_a_flipped_bit_anywhere_is_found_or_does_no_harm(tiny, every):
 def test_whole_files_with_other_weights_are_found(folder):
     shutil.rmtree(folder / "3" / "state")
     shutil.copytree(folder / "2" / "state", folder / "3" / "state")
-    with pytest.raises(
-        DataError, match=r"3 .*corrupted \(the checksum of array params/w dif"
-    ):
+    with pytest.raises(DataError, match=r"3 .*corrupted \(the .* of array params/w"):
         _read(folder)
     assert _restored_step(folder) == 2
 

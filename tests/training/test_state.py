@@ -171,10 +171,7 @@ def _schedule_of(name):
             lambda: make_optimizer(TrainOptions(optimizer="lion"), lambda _: 1e-3),
             r"config\.train\.optimizer is 'lion', expected adamw or module:function",
         ),
-        (
-            lambda: _schedule_of("linear"),
-            "expected cosine or cyclic_cosine or module:f",
-        ),
+        (lambda: _schedule_of("linear"), "expected cosine or cyclic_cosine or module"),
         (
             lambda: _schedule(50, 2, warmup_steps=100),
             "warmup_steps is 100, expected less than the 100",
