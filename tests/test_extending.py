@@ -7,16 +7,15 @@ import re
 import shutil
 import sys
 from dataclasses import replace
+from unittest import mock
 
 import jax
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from PIL import Image
 
 import radejax
 from radejax import models
-from radejax.cli.main import main
 from radejax.config import Config
 from radejax.core.errors import UserError
 from radejax.data.check import check_frames
@@ -37,18 +36,14 @@ from radejax.runs.evaluate import evaluate_run
 
 from . import small_models as small
 from . import toy_reader
+from .commands import run
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
-BLOCKS = re.findall(
-    r"^```python\n(.*?)^```",
-    (ROOT / "docs" / "extending.md").read_text(encoding="utf-8"),
-    re.MULTILINE | re.S,
-)
-RADAR_BLOCKS = re.findall(
-    r"^```py\n(.*?)^```",
-    (ROOT / "docs" / "own_radar.md").read_text(encoding="utf-8"),
-    re.MULTILINE | re.S,
-)
+
+
+def _blocks(page, language):
+    text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.S)
 
 
 @pytest.fixture(autouse=True)
@@ -57,7 +52,7 @@ def page(tmp_path, monkeypatch):
     folder = tmp_path / "modules"
     folder.mkdir()
     monkeypatch.syspath_prepend(folder)
-    (folder / "parts.py").write_text("\n\n".join(BLOCKS))
+    (folder / "parts.py").write_text("\n\n".join(_blocks("extending.md", "python")))
     shutil.copy(toy_reader.__file__, folder / "toy.py")
     yield
     _forget()
@@ -192,43 +187,36 @@ def test_commands_read_such_data_by_the_config(tmp_path, monkeypatch):
     config = Config().replace(data={"format": "toy:Toy"}, evaluation={"roi": None})
     given = ["--config", small.write_config(tmp_path / "config.py", config)]
 
-    def run(*words, code=0):
-        done = CliRunner().invoke(main, [str(word) for word in words])
-        assert done.exit_code == code, done.output
-        return done.output
-
-    report = json.loads(run("data", "check", root, *given, "--deep", "--json"))
+    report = json.loads(run("data", "check", root, *given, "--deep", "--json").stdout)
     assert report["version"] == "read by toy:Toy"
     assert [row["without_camera"] for row in report["sequences"]] == [1, 2]
-    assert [(row["train"], row["test"]) for row in report["sequences"]] == [
-        (2, 0),
-        (0, 2),
-    ]
+    assert [row["train"] for row in report["sequences"]] == [2, 0]
+    assert [row["test"] for row in report["sequences"]] == [0, 2]
     train = {row["split"]: row for row in report["objects"]}["train"]
     assert (train["Sedan"], report["summary"]["num_problems"]) == (2, 0)
 
     out = tmp_path / "records"
     text = run("preprocess", root, *given, "--out", out, "--sequences", 2)
-    assert "2 preprocessed" in text
+    assert "2 preprocessed" in text.output
     assert Records.open(out).keys() == {"2/0001", "2/0002"}
 
-    scenes = []
-    drawn = radejax.draw_frame
-    monkeypatch.setattr(
-        radejax, "draw_frame", lambda scene: scenes.append(scene) or drawn(scene)
-    )
+    draw = mock.Mock(wraps=radejax.draw_frame)
+    monkeypatch.setattr(radejax, "draw_frame", draw)
     out = tmp_path / "a.png"
     given += ["--data", root, "--out", out]
-    assert run("overlay", "1/0001", *given) == f"drew {out}\n"
-    text = run("overlay", "1/0002", *given)
+    assert run("overlay", "1/0001", *given).output == f"drew {out}\n"
+    text = run("overlay", "1/0002", *given).output
     assert "1 of 1 frames have no front image, 0 no camera" in text
-    both, radar = scenes
+    scenes = both, radar = [call.args[0] for call in draw.call_args_list]
     assert both.image is not None
     assert both.camera is not None
     assert radar.image is None
     assert [len(scene.ground_truth or ()) for scene in scenes] == [1, 1]
-    assert "leave it out" in run("overlay", "1/0002", *given, "--lidar", code=2)
-    assert "no frames of these" in run("overlay", "7/0001", *given, code=2)
+    for words, text in (
+        (("1/0002", "--lidar"), "leave it out"),
+        (("7/0001",), "no frames of these"),
+    ):
+        assert text in run("overlay", *words, *given, code=2).output
 
 
 def test_objects_that_cannot_be_learned_are_left_out_and_counted(tmp_path):
@@ -312,11 +300,12 @@ def test_what_a_reader_forgets_is_named(tmp_path, monkeypatch):
 @pytest.mark.parametrize("is_flat", [False, True])
 def test_written_folders_are_read(is_flat, tmp_path, monkeypatch):
     """Also those of a radar that measures only range and azimuth, with one bin per axis."""
-    (written,) = (block for block in RADAR_BLOCKS if "write_splits" in block)
+    (written,) = (
+        block for block in _blocks("own_radar.md", "py") if "write_splits" in block
+    )
     if is_flat:
-        written, count = re.subn(
-            r"(elevation_rad|doppler_mps)=.*", r"\1=[0.0],", written
-        )
+        axes = r"(elevation_rad|doppler_mps)=.*"
+        written, count = re.subn(axes, r"\1=[0.0],", written)
         assert count == 2
     monkeypatch.chdir(tmp_path)
     shape = (1, 64, 1, 48) if is_flat else (32, 64, 2, 48)

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from radejax.cli.main import main
 from radejax.config import load_config, load_module
 from radejax.core.errors import DataError, UserError
 from radejax.data.cameras import require_images
@@ -27,6 +26,7 @@ from radejax.runs.evaluate import evaluate_run
 from radejax.weights import image_backbone
 
 from . import small_models as small
+from .commands import run
 
 pytestmark = [
     pytest.mark.slow,  # several programs to compile
@@ -103,12 +103,11 @@ def from_images(data):
     return data.train("images", image_backbone=str(data.backbone))
 
 
-def embed(data, config, out, *options):
+def embed(data, config, out, code=0):
     """Run `radejax embed` and return its result."""
     path = small.write_config(data.runs / "config.py", config)
-    command = ["embed", str(data.folder), "--config", str(path), "--out", str(out)]
-    command += ["--image-backbone", str(data.backbone), *options]
-    return CliRunner().invoke(main, command)
+    words = [data.folder, "--config", path, "--out", out]
+    return run("embed", *words, "--image-backbone", data.backbone, code=code)
 
 
 @pytest.fixture(scope="module")
@@ -117,16 +116,15 @@ def embeddings(data, from_images, tmp_path_factory):
     path = min(data.folder.glob("1/cam-front/*.png"))
     content, state = path.read_bytes(), path.stat()
     path.write_bytes(b"")
-    result = embed(data, small_config(), out)
+    result = embed(data, small_config(), out, code=1)
     assert "12 frames: 0 were done, 11 preprocessed, 1 skipped" in result.output
-    assert result.exit_code == 1
     assert f"{path}: corrupted" in result.output
     path.write_bytes(content)
     os.utime(path, ns=(state.st_atime_ns, state.st_mtime_ns))
     for counts in ("11 were done, 1 preprocessed", "12 were done, 0 preprocessed"):
         assert counts in embed(data, small_config(), out).output
     wrong = small_config().with_fields({"model.image.size": (16, 48)})
-    assert "other records: options.shape is" in embed(data, wrong, out).output
+    assert "other records: options.shape is" in embed(data, wrong, out, code=2).output
     found = open_embeddings(out)
     assert (found.shape, np.dtype(found.dtype)) == ((2, 6, 96), np.float32)
     return out

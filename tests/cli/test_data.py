@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from radejax import Detector, KRadar, models
-from radejax.cli import figures, main
+from radejax.cli import figures
 from radejax.core.errors import DataError, UserError
 from radejax.data.kradar.tesseract import read_tesseract
 from radejax.data.records import Records
@@ -19,15 +19,9 @@ from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
 
 from .. import small_models as small
+from ..commands import run
 
 RELEASES = ("polar3d", "rpc")
-
-
-def _run(*arguments, code=0):
-    arguments = tuple(map(str, arguments))
-    result = click.testing.CliRunner().invoke(main.main, arguments)
-    assert result.exit_code == code, result.output
-    return result
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +41,7 @@ def disks(request, tensors, tmp_path_factory):
     folder = tmp_path_factory.mktemp(request.param)
     others, radar = folder / "others", folder / "radar"
     options = ("--to", request.param, "--rate", 0.1, "--out", others)
-    assert "12 preprocessed" in _run("reduce", tensors, *options).output
+    assert "12 preprocessed" in run("reduce", tensors, *options).output
     for path in others.glob(f"*/{request.param}_*.npy"):
         target = radar / path.parent.name / path.name
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -75,19 +69,19 @@ def _model(doppler_bins, root, release):
 def test_frames_are_checked_preprocessed_and_drawn(disks, tmp_path):
     release, roots, labels = disks
     words = (*roots, "--labels", labels)
-    report = json.loads(_run("data", "check", *words, "--deep", "--json").output)
+    report = json.loads(run("data", "check", *words, "--deep", "--json").output)
     assert report["summary"]["num_problems"] == 0
     assert [row["projections"] for row in report["sequences"]] == [4, 4, 4]
     records = tmp_path / "records"
     for shard, count in (("0/2", 6), ("0/1", 6)):
-        text = _run("preprocess", *words, "--out", records, "--shard", shard).output
+        text = run("preprocess", *words, "--out", records, "--shard", shard).output
         assert f"{count} preprocessed, 0 skipped" in text
     opened = Records.open(records)
     assert (len(opened.keys()), opened.source["release"]) == (12, release)
     assert opened.shape == (24, 16, 4 + 3)
     data = ("--data", ",".join(map(str, roots)), "--labels", labels)
     out = tmp_path / "a.png"
-    _run("overlay", min(opened.keys()), *data, "--slices", "--out", out)
+    run("overlay", min(opened.keys()), *data, "--slices", "--out", out)
     assert out.stat().st_size > 10_000
     frames = KRadar(roots, labels, visibility=None)
     (scene,) = figures.viewer_scenes([frames[0]], frames.grid)
@@ -102,7 +96,7 @@ def test_the_full_size_keeps_the_radar_of_the_config(tmp_path, monkeypatch):
     radar = {"preset": "ideal", "noise_db": 100.0, "azimuth_elements": 5.0}
     config = types.SimpleNamespace(simulation=SimulationOptions(radar=radar))
     monkeypatch.setattr("radejax.load_config", lambda _: config)
-    _run("simulate", "--config", "own", "--full-size", "--out", tmp_path / "out")
+    run("simulate", "--config", "own", "--full-size", "--out", tmp_path / "out")
     (options,) = made
     assert dict(options.radar) == {"preset": "ideal", "noise_db": 100.0}
 
@@ -112,7 +106,7 @@ def test_boxes_are_found_in_files_and_arrays(disks, tensors, tmp_path):
     saved = _model({"polar3d": 4, "rpc": 0}[release], tensors, release)
     save_model(saved, tmp_path / "model")
     words = ("--workdir", tmp_path / "model", "--out", tmp_path / "boxes")
-    text = _run("detect", roots[0], *words, "--batch-size", 4).output
+    text = run("detect", roots[0], *words, "--batch-size", 4).output
     assert "in 12 frames" in text
     paths = sorted(roots[0].glob(f"1/{release}_*.npy"))
     names = {f"1_{path.stem.partition('_')[2]}.json" for path in paths}
@@ -151,13 +145,13 @@ def test_points_of_two_disks(disks, tensors, tmp_path):
     (radar / "9").mkdir(exist_ok=True)
     (radar / "9" / f"{release}_00001.npy").write_bytes(b"no array")
     words = ("--rate", 0.1, "--out", tmp_path / "found")
-    text = _run("points", radar, others, *words, code=1).output
+    text = run("points", radar, others, *words, code=1).output
     (radar / "9" / f"{release}_00001.npy").unlink()
     (radar / "9").rmdir()
     assert "12 preprocessed, 1 skipped" in text
     assert f"skipped {radar / '9' / release}_00001.npy: " in text
     expected = tmp_path / "expected"
-    _run("points", tensors, "--rate", 0.1, "--out", expected)
+    run("points", tensors, "--rate", 0.1, "--out", expected)
     paths = sorted(expected.glob("*/rpc_*.npy"))
     assert len(paths) == 12
     grid = KRadar(tensors).grid
@@ -169,7 +163,7 @@ def test_points_of_two_disks(disks, tensors, tmp_path):
         elevation_rad = grid.elevation_rad[found[:, 10].astype(int)]
         np.testing.assert_allclose(found[:, 2], found[:, 5] * np.sin(elevation_rad))
     words = ("--to", "pcd", "--method", "cfar", "--threshold-db", 3)
-    _run("points", radar, others, *words, "--sequences", 1, "--out", tmp_path / "c")
+    run("points", radar, others, *words, "--sequences", 1, "--out", tmp_path / "c")
     assert len(list((tmp_path / "c").glob("1/rpc_*.pcd"))) == 4
 
 
@@ -194,6 +188,6 @@ def test_a_run_is_trained_evaluated_and_detects(disks, tmp_path, doppler_bins):
     assert result.exit_code == 0, result.output
     assert Records.open(tmp_path / "records").shape == (24, 16, doppler_bins + 3)
     assert (tmp_path / "run/evaluation/metrics.json").is_file()
-    _run("evaluate", tmp_path / "run", "--split", "train")
+    run("evaluate", tmp_path / "run", "--split", "train")
     words = ["--workdir", str(tmp_path / "run"), "--out", str(tmp_path / "boxes")]
-    assert "in 12 frames" in _run("detect", roots[0], *words).output
+    assert "in 12 frames" in run("detect", roots[0], *words).output

@@ -3,14 +3,13 @@
 import pathlib
 import shutil
 from types import SimpleNamespace
+from unittest import mock
 
-import click.testing
 import numpy as np
 import pytest
 from PIL import Image
 
 import radejax
-from radejax.cli.figures import overlay
 from radejax.config import Config
 from radejax.core.structures import Boxes
 from radejax.data.kradar import KRadar
@@ -19,16 +18,15 @@ from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
 from radejax.visualize import style
 
-ONE_FRAME = SimulationOptions(
-    train_sequences=1, test_sequences=0, frames_per_sequence=1
-)
+from ..commands import run
 
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
     """One simulated sequence of one frame."""
+    sizes = {"train_sequences": 1, "test_sequences": 0, "frames_per_sequence": 1}
     folder = tmp_path_factory.mktemp("overlay") / "data"
-    return simulate_dataset(ONE_FRAME, folder, progress=False)
+    return simulate_dataset(SimulationOptions(**sizes), folder, progress=False)
 
 
 @pytest.fixture
@@ -39,11 +37,8 @@ def drawn(monkeypatch):
     return found
 
 
-def _run(name, roots, *arguments, code=0):
-    words = [name, "--data", str(roots), *map(str, arguments)]
-    done = click.testing.CliRunner().invoke(overlay, words)
-    assert done.exit_code == code, done.output
-    return done
+def _run(name, roots, *words, code=0):
+    return run("overlay", name, "--data", roots, *words, code=code)
 
 
 def test_frames_have_several_names(root, drawn):
@@ -68,12 +63,9 @@ def test_frames_have_several_names(root, drawn):
 
 def test_figures_slices_and_a_sequence_in_motion(root, tmp_path):
     sizes = []
-    for name, options in (
-        ("a.png", ()),
-        ("slices.png", ("--slices",)),
-        ("all.gif", ("--max-frames", 3)),
-    ):
-        _run("1", root, "--out", tmp_path / name, *options)
+    options = {"a.png": (), "slices.png": ("--slices",), "all.gif": ("--max-frames", 3)}
+    for name, words in options.items():
+        _run("1", root, "--out", tmp_path / name, *words)
         with Image.open(tmp_path / name) as picture:
             assert picture.format == name[-3:].upper()
             colors = picture.convert("RGB").getcolors(1 << 24)
@@ -142,13 +134,12 @@ def test_lidar_points_are_drawn_in_the_radar_frame(root, tmp_path, monkeypatch, 
     (disk / "1" / "os2-64").mkdir(parents=True)
     header = "FIELDS x y z intensity\nPOINTS 1\nDATA ascii\n"
     (disk / "1" / "os2-64" / name).write_text(f"{header}30 2 1 0\n")
-    scenes = []
-    draw_frame = radejax.draw_frame
-    monkeypatch.setattr(
-        radejax, "draw_frame", lambda scene: scenes.append(scene) or draw_frame(scene)
-    )
+    draw = mock.Mock(wraps=radejax.draw_frame)
+    monkeypatch.setattr(radejax, "draw_frame", draw)
     _run("1", f"{root},{disk}", "--lidar")
-    np.testing.assert_allclose(scenes[0].lidar_m, [[30 - 2.54, 2 + 0.3, 1]])
+    np.testing.assert_allclose(
+        draw.call_args.args[0].lidar_m, [[30 - 2.54, 2 + 0.3, 1]]
+    )
     assert frame.radar_from_lidar_m[:2] == (-2.54, 0.3)
     text = _run("1", f"{root},{disk}", "--lidar", "--slices", code=2).output
     assert "--slices shows no LiDAR points" in text

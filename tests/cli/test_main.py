@@ -4,21 +4,16 @@ import json
 import sys
 from types import SimpleNamespace
 
-import click.testing
+import click
 import pytest
 
 from radejax.cli import main
 from radejax.cli.figures import MODEL
 from radejax.core.errors import UserError
-from radejax.data.kradar import write
-from radejax.data.kradar.labels import Label
 from radejax.inference.saved import save_model
 
 from .. import small_models
-
-
-def _run(*arguments):
-    return click.testing.CliRunner().invoke(main.main, [str(a) for a in arguments])
+from ..commands import run
 
 
 def _commands():
@@ -33,9 +28,8 @@ def _commands():
 
 @pytest.mark.parametrize("command", _commands(), ids=" ".join)
 def test_help_shows_an_example(command):
-    result = _run(*command, "--help")
-    assert result.exit_code == 0
-    assert "Example: radejax " + " ".join(command) in " ".join(result.output.split())
+    text = run(*command, "--help").output
+    assert "Example: radejax " + " ".join(command) in " ".join(text.split())
 
 
 @pytest.mark.parametrize(
@@ -57,25 +51,7 @@ def test_help_shows_an_example(command):
     ],
 )
 def test_wrong_use_is_exit_code_2_and_a_clear_line(arguments, message, tmp_path):
-    result = _run(*arguments)
-    assert result.exit_code == 2
-    assert message in result.output
-    assert "Traceback" not in result.output
-
-
-@pytest.fixture
-def root(tmp_path):
-    """A K-Radar root with one label and nothing else."""
-    label = Label("Sedan", (10.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0), "R", 1)
-    path = tmp_path / "kradar" / "1" / "info_label_v2_1" / "00033_00001.txt"
-    write.write_labels(path, (33, 1, 2, 1, 4), 1.0, [label])
-    return tmp_path / "kradar"
-
-
-def test_a_folder_without_frames_says_what_was_looked_for(root, tmp_path):
-    result = _run("detect", root, "--workdir", MODEL, "--out", tmp_path / "out")
-    assert result.exit_code == 2
-    assert "tesseract_*.mat" in result.output
+    assert message in run(*arguments, code=2).output
 
 
 def test_failed_frames_are_listed_with_exit_code_1(tmp_path, monkeypatch):
@@ -83,26 +59,18 @@ def test_failed_frames_are_listed_with_exit_code_1(tmp_path, monkeypatch):
     failed = {f"5/{i:05d}": "x of the box is nan" for i in range(30)}
     place = "radejax.inference.detect_files"
     monkeypatch.setattr(f"{place}.find_inputs", lambda *args, **options: None)
-    monkeypatch.setattr(
-        f"{place}.detect_files", lambda *args, **options: (count, failed)
-    )
+    monkeypatch.setattr(f"{place}.detect_files", lambda *_, **__: (count, failed))
     words = ("detect", tmp_path, "--workdir", MODEL, "--out", tmp_path / "out")
-    result = _run(*words)
-    assert result.exit_code == 1
-    first, *lines = result.stdout.splitlines()
+    first, *lines = run(*words, code=1).stdout.splitlines()
     assert first.endswith("; 30 failed")
     assert lines == [f"failed {k}: {x}" for k, x in list(failed.items())[:20]]
-    result = _run(*words, "--json")
-    assert result.exit_code == 1
-    assert json.loads(result.stdout)["failed"] == failed
+    assert json.loads(run(*words, "--json", code=1).stdout)["failed"] == failed
 
 
 def test_debug_shows_the_traceback(tmp_path):
-    arguments = ("export", tmp_path, "--out", tmp_path / "out")
-    plain = _run(*arguments)
-    assert plain.exit_code == 2
-    assert plain.output.startswith(f"error: no model in {tmp_path}")
-    assert isinstance(_run(*arguments, "--debug").exception, FileNotFoundError)
+    words = ("export", tmp_path, "--out", tmp_path / "out")
+    assert run(*words, code=2).output.startswith(f"error: no model in {tmp_path}")
+    assert isinstance(run(*words, "--debug", code=1).exception, FileNotFoundError)
 
 
 def test_evaluate_takes_flags_as_its_script_does(monkeypatch):
@@ -116,7 +84,7 @@ def test_evaluate_takes_flags_as_its_script_does(monkeypatch):
 
     monkeypatch.setattr(evaluate, "evaluate_run", evaluate_run)
     flags = ("--checkpoint=best", "--data", "a,b", "--data=c", "--label-version=v1.0")
-    assert "Written to there" in _run("evaluate", "--workdir", "run", *flags).output
+    assert "Written to there" in run("evaluate", "--workdir", "run", *flags).output
     other = {"roots": ("a", "b", "c"), "label_version": "v1.0"}
     assert seen.pop() == ("run", {"step": "best", "split": "test", "other": other})
 
@@ -124,7 +92,7 @@ def test_evaluate_takes_flags_as_its_script_does(monkeypatch):
 def test_export_takes_an_exported_folder(tmp_path):
     packed = tmp_path / "packed"
     save_model(small_models.saved(), packed)
-    done = _run("export", packed, "--out", tmp_path / "hub", "--format", "huggingface")
+    done = run("export", packed, "--out", tmp_path / "hub", "--format", "huggingface")
     assert f"MiB written to {tmp_path / 'hub'}" in done.output
     for name in ("model.safetensors", "config.json"):
         written = (tmp_path / "hub" / name).read_bytes()
@@ -144,9 +112,12 @@ def test_roots_are_separate_repeated_or_with_commas(tmp_path, monkeypatch):
 
     monkeypatch.setattr(check, "check_dataset", look)
     monkeypatch.setattr("radejax.cli.entry.read_frames", look)
-    assert "opened a b c d,e" in _run("data", "check", *names).output
-    assert "'x' does not exist" in _run("data", "check", "a", "x").output
-    assert "opened a b c" in _run("overlay", "1", "--data", "a,b", "--data", "c").output
+    for words, text in (
+        (("data", "check", *names), "opened a b c d,e"),
+        (("data", "check", "a", "x"), "'x' does not exist"),
+        (("overlay", "1", "--data", "a,b", "--data", "c"), "opened a b c"),
+    ):
+        assert text in run(*words, code=2).output
 
 
 def test_a_part_of_the_data_is_chosen(monkeypatch, tmp_path):
@@ -161,13 +132,14 @@ def test_a_part_of_the_data_is_chosen(monkeypatch, tmp_path):
     monkeypatch.setattr(check, "check_dataset", look)
     monkeypatch.setattr("radejax.cli.entry.read_frames", look)
     monkeypatch.setitem(sys.modules, "rerun", None)
-    assert _run("view", tmp_path).output.startswith("error: recordings need rerun, wh")
+    text = run("view", tmp_path, code=2).output
+    assert text.startswith("error: recordings need rerun, wh")
     assert not seen  # no frames are read, and there is no bar
     checked = "radejax.visualize.recordings.check_recording"
     monkeypatch.setattr(checked, lambda path: None)
     part = ("--sequences", "1,58", "--weather", "fog", "--weather", "rain")
     for command in (["data", "check"], ["preprocess", "--out", tmp_path], ["view"]):
-        assert "opened" in _run(*command, tmp_path, *part).output
+        assert "opened" in run(*command, tmp_path, *part, code=2).output
     assert seen == 3 * [((1, 58), ("fog", "rain"))]
-    _run("data", "check", tmp_path)
+    run("data", "check", tmp_path, code=2)
     assert seen[-1] == (None, None)

@@ -1,13 +1,13 @@
 """Figures of a run: which frames in which order, and what a sample looks like."""
 
 import dataclasses
+import functools
 import json
+from unittest import mock
 
-import click.testing
 import numpy as np
 import pytest
 
-from radejax.cli.main import main
 from radejax.config import load_config
 from radejax.core.structures import NARROW_ROI, Boxes
 from radejax.data.kradar import KRadar
@@ -20,27 +20,23 @@ from radejax.runs import figures
 from radejax.runs.figures import draw_training_samples
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.dataset import simulate_dataset
-from radejax.visualize.draw import draw_scenes
 
 from .. import small_models as small
+from ..commands import run
 
 
 def test_samples_are_drawn_with_their_augmentation(tmp_path, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(
-        figures, "draw_samples", lambda rows, grid: drawn.append((rows, grid))
-    )
+    draw = mock.Mock(wraps=figures.draw_samples)
+    monkeypatch.setattr(figures, "draw_samples", draw)
     config = small.shrink_run(load_config("quickstart_fusion:short")).replace(
         simulation={"train_sequences": 1, "test_sequences": 0},
         data={"roots": (str(tmp_path / "data"),), "mirror_probability": 1.0},
         train={"batch_size": 3},
     )
     config = config.replace(simulation={"frames_per_sequence": 3})
-    draw_training_samples(config, count=2)
-    ((rows, grid),) = drawn
+    figure = draw_training_samples(config, count=2)
+    rows, _ = draw.call_args.args
     assert len(rows) == 2
-    monkeypatch.undo()
-    figure = figures.draw_samples(rows, grid)
     titles = [ax.get_title() for ax in figure.axes]
     assert titles[:2] == [rows[0][0].title, "input of the network"]
     assert len(titles) == 8
@@ -66,12 +62,8 @@ def test_bins_out_of_view_and_frames_without_image_do_not_count():
 @pytest.fixture(scope="module")
 def root(tmp_path_factory):
     """Two simulated sequences of one frame."""
-    options = SimulationOptions(
-        train_sequences=0,
-        test_sequences=2,
-        frames_per_sequence=1,
-        output="projection",
-    )
+    sizes = {"train_sequences": 0, "test_sequences": 2, "frames_per_sequence": 1}
+    options = SimulationOptions(output="projection", **sizes)
     folder = tmp_path_factory.mktemp("compared") / "data"
     return simulate_dataset(options, folder, progress=False)
 
@@ -81,20 +73,17 @@ def test_scenes_show_which_boxes_match(root):
     frame = frames[0]
     box = np.array([[10.0, 0, 0, 4, 2, 1.5, 0], [30, 0, 0, 4, 2, 1.5, 0]])
     far = [[50.0, 60.0, 0, 4, 2, 1.5, 0]]  # outside the region
-    frame = dataclasses.replace(
-        frame, boxes=np.concatenate([box, far]), classes=np.array(["Sedan"] * 3)
-    )
+    boxes, classes = np.concatenate([box, far]), np.array(["Sedan"] * 3)
+    frame = dataclasses.replace(frame, boxes=boxes, classes=classes)
     found = Boxes.one_frame([far[0], box[1]], ["Sedan"] * 2, [0.9, 0.8])
     projection = frame.read_projection(frames.grid)
-    scene = figures.frame_scene(
-        frame, projection, frames.grid, predictions=found, roi=NARROW_ROI, iou=0.5
-    )
+    draw = functools.partial(figures.frame_scene, frame, projection, frames.grid)
+    scene = draw(predictions=found, roi=NARROW_ROI, iou=0.5)
     assert scene.matches is not None
     assert scene.matches.ground_truth.tolist() == [0, 1, -1]
     assert scene.matches.predictions.tolist() == [-1, 1]
     assert scene.matches.iou == 0.5
-    none = Boxes.one_frame([], [], [])
-    scene = figures.frame_scene(frame, projection, frames.grid, predictions=none)
+    scene = draw(predictions=Boxes.one_frame([], [], []))
     assert scene.matches is not None
     assert scene.matches.ground_truth.tolist() == [0, 0, 0]
 
@@ -109,21 +98,15 @@ def test_compared_runs_are_drawn_side_by_side(root, tmp_path, monkeypatch, caplo
     paths = tmp_path / "all.json", tmp_path / "few.json"
     paths[0].write_text(json.dumps(rows))
     paths[1].write_text(json.dumps(rows[::2]))
-    drawn = []
-    monkeypatch.setattr(
-        figures, "draw_scenes", lambda x: drawn.append(x) or draw_scenes(x)
-    )
+    draw = mock.Mock(wraps=figures.draw_scenes)
+    monkeypatch.setattr(figures, "draw_scenes", draw)
     words = ["compare", *paths, "--data", root, "--bootstrap", 5, "--figures", "pdf"]
-    runner = click.testing.CliRunner()
-    done = runner.invoke(main, list(map(str, words)))
-    assert "--figures needs a folder" in done.stderr
-    words += ["--out", tmp_path / "out", "--roi", "wide"]
-    done = runner.invoke(main, list(map(str, words)))
-    assert done.exit_code == 0, done.output
+    assert "--figures needs a folder" in run(*words, code=2).stderr
+    run(*words, "--out", tmp_path / "out", "--roi", "wide")
     names = {path.name for path in (tmp_path / "out").glob("*.pdf")}
     curves = {"comparison_3d_iou30.pdf", "comparison_bev_iou30.pdf"}
     assert names == curves | {f"scenes_{frame.weather}.pdf" for frame in frames}
-    for one, other in drawn:
+    for one, other in (call.args[0] for call in draw.call_args_list):
         assert one.title.startswith("all.json: ")
         assert other.title.startswith("few.json: ")
         assert one.matches is not None

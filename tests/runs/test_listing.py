@@ -2,10 +2,9 @@
 
 import json
 
-from click.testing import CliRunner
-
-from radejax.cli.evaluate import runs
 from radejax.config import Config
+
+from ..commands import run
 
 
 def _write(folder, config, minutes):
@@ -32,8 +31,7 @@ def test_runs_are_listed_with_what_differs(tmp_path):
     changed = config.replace(seed=1, loss={"weights": {"focal": 4.0, "gwd": 1.0}})
     # It was continued: the second start took 2 minutes.
     _write(tmp_path / "seeds" / "b", changed, [0.5, 1.5, 0.5, 2.0])
-    done = CliRunner().invoke(runs, [str(tmp_path), "--json"])
-    first, second = json.loads(done.output)
+    first, second = json.loads(run("runs", tmp_path, "--json").output)
     names = {"seed", "loss.weights.focal", "init_partial"}
     assert first == {
         "run": "a",
@@ -47,12 +45,10 @@ def test_runs_are_listed_with_what_differs(tmp_path):
     assert (second["run"], second["minutes"], second["ap"]) == ("seeds/b", 3.5, None)
     assert second["fields"].items() >= {"seed": 1, "loss.weights.focal": 4.0}.items()
     assert set(second["fields"]) == names
-    table = CliRunner().invoke(runs, [str(tmp_path)]).output
+    table = run("runs", tmp_path).output
     assert "AP: map_3d_iou30/p/roi=narrow, test split" in table
     assert "seed=1, loss.weights.focal=4.0" in table
 
 
 def test_a_folder_without_runs_is_wrong_use(tmp_path):
-    done = CliRunner().invoke(runs, [str(tmp_path)])
-    assert done.exit_code == 2
-    assert "no run in" in done.stderr
+    assert "no run in" in run("runs", tmp_path, code=2).stderr

@@ -6,12 +6,11 @@ import json
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from radejax.cli.main import main
+from radejax.config import Config
 from radejax.core.errors import DataError, UserError
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.simulation.config import SimulationOptions
@@ -20,6 +19,8 @@ from radejax.simulation.fitting import fit_files, fit_radar
 from radejax.simulation.radar import sensor, tensor
 from radejax.simulation.radar.tensor import RadarParameters
 
+from .. import small_models as small
+from ..commands import run
 from .radar.test_tensor import points
 
 GRID = RadarGrid.reduced(
@@ -119,10 +120,8 @@ def recorded(tmp_path_factory):
 
 def test_command_writes_section_and_figure_and_simulates_them(recorded, tmp_path):
     out = tmp_path / "fit"
-    arguments = ["simulate", "--fit", str(recorded / "1"), "--fit", str(recorded / "2")]
-    done = CliRunner().invoke(main, [*arguments, "--out", str(out)])
-    assert done.exit_code == 0, done.output
-    assert "noise_db: [1" in done.output
+    words = ["--fit", recorded / "1", "--fit", recorded / "2", "--out", out]
+    assert "noise_db: [1" in run("simulate", *words).output
     with Image.open(out / "fit.png") as figure:
         assert figure.width > 2 * figure.height
     section = json.loads((out / "radar.json").read_text())
@@ -130,18 +129,13 @@ def test_command_writes_section_and_figure_and_simulates_them(recorded, tmp_path
     low, high = section["radar"]["noise_db"]
     assert 107.0 < low <= high < 111.0
     again = tmp_path / "again"
-    arguments = ["simulate", "--radar", str(out / "radar.json"), "--frames", "1"]
-    config = tmp_path / "config.py"
-    config.write_text(
-        "from radejax.config import Config\n"
-        "def get_config(arg=None):\n"
-        "    model = {'doppler_bins': 16, 'elevation_bins': 9}\n"
-        f"    simulation = {dict(SMALL, train_sequences=1, test_sequences=0)}\n"
-        "    return Config(model=model, simulation=simulation)\n"
+    config = Config(
+        model={"doppler_bins": 16, "elevation_bins": 9},
+        simulation=SMALL | {"train_sequences": 1, "test_sequences": 0},
     )
-    arguments += ["--config", str(config), "--out", str(again)]
-    done = CliRunner().invoke(main, arguments)
-    assert done.exit_code == 0, done.output
+    words = ["--radar", out / "radar.json", "--frames", 1, "--out", again]
+    words += ["--config", small.write_config(tmp_path / "config.py", config)]
+    run("simulate", *words)
     marker = json.loads((again / "simulation.json").read_text())
     assert marker["config"]["radar"] == section["radar"]
     assert next(again.glob("*/radar_tesseract/*.mat")).stat().st_size > 1e6
