@@ -66,12 +66,6 @@ def test_files_of_a_killed_process_do_not_stop_the_cache(tmp_path):
     (folder / "orphan-atime").write_bytes(b"")
     environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
-    done = subprocess.run(
-        [sys.executable, "-c", _PROGRAM],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert done.stderr == ""
+    options = {"env": environment, "capture_output": True, "check": True}
+    assert subprocess.run([sys.executable, "-c", _PROGRAM], **options).stderr == b""
     assert len(list(folder.iterdir())) > 2
