@@ -56,15 +56,11 @@ def test_own_labels_are_in_the_order_of_their_numbers(tmp_path):
     assert list(found) == [(1, "00009_00006"), (1, "00010_00007")]
 
 
-@pytest.mark.parametrize(
-    "layout",
-    [
-        "{}/{}.txt",
-        "KRadar_revised_visibility/{}/{}.txt",
-        "{}_info_label_revised/{}.txt",
-        "labels/{}/info_label/{}.txt",
-    ],
-)
+LAYOUTS = ("{}/{}.txt", "KRadar_revised_visibility/{}/{}.txt")
+LAYOUTS += ("{}_info_label_revised/{}.txt", "labels/{}/info_label/{}.txt")
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("zipped", [False, True])
 def test_label_revisions_in_their_layouts(tmp_path, layout, zipped):
     names = [layout.format(12, LABEL), layout.format(3, LABEL), "readme.txt"]
@@ -215,8 +211,13 @@ def test_grid_of_the_roots(tmp_path):
     write.write_grid(b, dataclasses.replace(grid, fov_range_m=50.0))
     with pytest.raises(DataError, match="datasets of different sensors"):
         KRadar([a, b])
-    broken = ('{"range_m": 3}', "[" * 100_000, "9" * 5000, '{"range_m": 1e400}', "1")
-    for text in broken:
+    for text in (
+        '{"range_m": 3}',
+        "[" * 100_000,
+        "9" * 5000,
+        '{"range_m": 1e400}',
+        "1",
+    ):
         touch(b / "radar_grid.json", text)
         with pytest.raises(DataError, match=r"radar_grid\.json"):
             KRadar(b)
@@ -228,11 +229,10 @@ def test_grid_of_the_roots(tmp_path):
 def test_conditions_of_the_published_sequences(shared):
     with open(shared / "data/kradar/sequences.csv") as file:
         rows = {int(row["seq"]): row for row in csv.DictReader(file)}
-    names = ("environment", "time", "weather")
-    assert {
-        number: Conditions(*[row[name] for name in names])
-        for number, row in rows.items()
-    } == KRADAR_CONDITIONS
+    for number, row in rows.items():
+        conditions = Conditions(row["environment"], row["time"], row["weather"])
+        assert KRADAR_CONDITIONS[number] == conditions
+    assert rows.keys() == KRADAR_CONDITIONS.keys()
     assert {row["weather"] for row in rows.values()} == set(WEATHERS)
 
 
