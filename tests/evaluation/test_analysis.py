@@ -11,12 +11,7 @@ from radejax.evaluation.report import write_report
 from radejax.evaluation.results import ReportOptions
 
 CLASSES = ("Sedan", "Bus or Truck")
-
-
-FRAMES = {
-    "frame": np.arange(4) + 100,
-    "time": np.array(["day", "day", "night", "night"]),
-}
+FRAMES = {"frame": np.arange(4) + 100, "time": np.repeat(["day", "night"], 2)}
 
 
 def make(truth_rows, found_rows):

@@ -5,13 +5,8 @@ import pytest
 import scipy.stats
 
 from radejax.core.errors import UserError
-from radejax.evaluation import kitti
-from radejax.evaluation.comparison import (
-    compare,
-    compare_files,
-    comparison_tables,
-    difference,
-)
+from radejax.evaluation import comparison, kitti
+from radejax.evaluation.comparison import compare, compare_files, difference
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files import Source, evaluate_files, stored_options
 from radejax.evaluation.report import write_report
@@ -109,7 +104,7 @@ def test_a_class_in_one_sequence_is_not_tested(num_seeds, in_one):
         elif row.kind == "all":
             assert not np.isnan(values).any()
             assert (row.is_significant is None) == (num_seeds == 1)
-    text = str([table.rows for table in comparison_tables(rows, "a", "b")])
+    text = str([table.rows for table in comparison.comparison_tables(rows, "a", "b")])
     assert ("'not tested'" in text) == (num_seeds == 3 and in_one != CLASSES)
     assert "'-'" in text
 
@@ -167,9 +162,8 @@ def test_a_gain_has_its_deviation_and_is_paired_by_seed():
 
 # Runs in files ------------------------------------------------------------------------
 
-OPTIONS = ReportOptions(
-    bootstrap=30, roi=None, plots=False, protocols=("all_point", "kradar_r40")
-)
+PROTOCOLS = ("all_point", "kradar_r40")
+OPTIONS = ReportOptions(bootstrap=30, roi=None, plots=False, protocols=PROTOCOLS)
 
 
 def test_comparisons_are_the_stored_ones(

@@ -150,17 +150,13 @@ def test_wrong_sources_are_named(stored):
 
 def test_every_way_in_gives_the_same_numbers(stored, scene):
     folder, source = stored
-    options = ReportOptions(
-        roi=None, plots=False, protocols=("all_point", "kradar_r40")
-    )
+    protocols = ("all_point", "kradar_r40")
+    options = ReportOptions(roi=None, plots=False, protocols=protocols)
 
     def aps(path, source, protocol=None, condition="all"):
         made = files.evaluate_files(path, folder / f"{path.name}_out", source, options)
-        return [
-            row.ap_or_none
-            for row in made.results
-            if row.condition == condition and protocol in (None, row.protocol)
-        ]
+        rows = [row for row in made.results if row.condition == condition]
+        return [x.ap_or_none for x in rows if protocol in (None, x.protocol)]
 
     one = aps(folder / "found.json", source)
     # A report contains everything that is needed to repeat it.
@@ -256,12 +252,10 @@ def test_a_config_of_another_program_has_no_classes(stored):
 
 def test_own_classes_that_are_not_chosen_are_known(scene, tmp_path):
     *tables, frames = scene
-    tables = [
-        {**x, "cls": np.where(x["cls"] == "Sedan", "Car", "Tram")} for x in tables
-    ]
-    options = ReportOptions(
-        roi=None, plots=False, protocols=("all_point",), classes=("Car", "Tram")
-    )
+    names = (np.where(x["cls"] == "Sedan", "Car", "Tram") for x in tables)
+    tables = [{**x, "cls": cls} for x, cls in zip(tables, names, strict=True)]
+    options = ReportOptions(roi=None, plots=False, protocols=("all_point",))
+    options = options.replace(classes=("Car", "Tram"))
     part = options.replace(classes=("Car",), known_classes=options.classes)
     for name, of in (("all", options), ("part", part)):
         write_report(*tables, frames, tmp_path / name, of)
@@ -366,13 +360,9 @@ def test_a_report_replaces_all_of_an_earlier_one(stored, caplog):
 
 def test_exported_boxes_are_those_that_count(stored):
     folder, source = stored
-    options = ReportOptions(
-        roi=(0, 15, -3, 3, -2, 6),
-        plots=False,
-        kitti=True,
-        score_threshold=0.3,
-        classes=("Sedan",),
-    )
+    region = (0, 15, -3, 3, -2, 6)
+    options = ReportOptions(roi=region, plots=False, kitti=True, classes=("Sedan",))
+    options = options.replace(score_threshold=0.3)
     made = files.evaluate_files(folder / "found.json", folder / "out", source, options)
     place = folder / "out" / "kitti" / "0.3" / "all"
     truth, found, _ = kitti.read_kitti(place)
