@@ -190,6 +190,13 @@ def official_calibration() -> CameraCalibration:
     )
 
 
+def forward_camera(**fields: Any) -> CameraCalibration:
+    """100 x 80 pixels, focal length 50, looking along x from the radar."""
+    settings = {"intrinsics": (50.0, 50.0, 50.0, 40.0), "width": 100, "height": 80}
+    settings["radar_from_lidar_m"] = (0.0, 0.0, 0.0)
+    return calibration(**(settings | fields))
+
+
 def calibration(**fields: Any) -> CameraCalibration:
     settings = {
         "intrinsics": (24.0, 24.0, 24.0, 16.0),

@@ -90,10 +90,8 @@ def test_every_cell_is_a_config_and_its_command_makes_it(table):
         words = work.command(name, 2).split()
         file = ablation.CONFIGS.parent / words[words.index("--config") + 1]
         again = load_config(str(file))
-        given = (
-            word.removeprefix("--config.") for word in words if "--config." in word
-        )
-        texts = dict(text.split("=") for text in given)
+        given = [word for word in words if "--config." in word]
+        texts = dict(word.removeprefix("--config.").split("=") for word in given)
         assert with_texts(again, texts) == config
         if not cell.exchanges:
             seen.append((config.model_dump_json(), cell.release))

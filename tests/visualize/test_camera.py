@@ -8,16 +8,11 @@ from radejax.core.structures import Boxes
 from radejax.geometry.camera import CameraCalibration
 from radejax.visualize import camera
 
+from .. import small_models as small
+
 # Looks along +x from the ego origin: u = 64 - 100 y / x, v = 36 - 100 z / x.
-CALIBRATION = CameraCalibration(
-    intrinsics=np.array([100.0, 100.0, 64.0, 36.0]),
-    distortion=np.zeros(5),
-    rotation=np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]),
-    translation_m=np.zeros(3),
-    width=128,
-    height=72,
-    radar_from_lidar_m=np.zeros(3),
-)
+INTRINSICS = (100.0, 100.0, 64.0, 36.0)
+CALIBRATION = small.forward_camera(intrinsics=INTRINSICS, width=128, height=72)
 IMAGE = np.zeros((72, 128, 3), np.uint8)
 BOX = [12.0, 1.0, 0.0, 4.0, 2.0, 1.0, 0.0]
 BEHIND = [-12.0, *BOX[1:]]

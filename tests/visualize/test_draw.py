@@ -10,7 +10,6 @@ from matplotlib.collections import LineCollection, PathCollection, QuadMesh
 
 from radejax.core.errors import UserError
 from radejax.core.structures import Boxes
-from radejax.geometry.camera import CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.visualize import draw, style
 from radejax.visualize.style import COLOR_MAP, Scene, save_figure
@@ -69,9 +68,8 @@ def test_a_scan_of_360_degrees_is_drawn_whole():
     FigureCanvasAgg(bev.figure).draw()
     assert "−100" in [t.get_text() for t in bev.get_yticklabels()]
     (bar,) = bev.child_axes
-    x_m, power, range_m = (
-        ax.yaxis.label.get_window_extent() for ax in (bev, bar, polar)
-    )
+    labels = [ax.yaxis.label for ax in (bev, bar, polar)]
+    x_m, power, range_m = (label.get_window_extent() for label in labels)
     assert x_m.x0 > 0
     assert power.x1 < range_m.x0
     lines = [c for c in polar.collections if isinstance(c, LineCollection)]
@@ -168,15 +166,8 @@ def test_drawing_leaves_pyplot_alone_and_works_in_threads(tmp_path):
 def test_lidar_points_are_drawn_on_their_pixels():
     points_m = np.array([[10.0, 1.0, 0.5], [-10.0, 0, 0], [10.0, 90.0, 0]])
     image = np.zeros((72, 128, 3), np.uint8)
-    camera = CameraCalibration(
-        rotation=np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]),
-        translation_m=np.zeros(3),
-        intrinsics=np.array([100.0, 100.0, 64.0, 36.0]),
-        distortion=np.zeros(5),
-        width=128,
-        height=72,
-        radar_from_lidar_m=np.zeros(3),
-    )
+    size = {"width": 128, "height": 72}
+    camera = small.forward_camera(intrinsics=(100.0, 100.0, 64.0, 36.0), **size)
     shown = scene(image=image, camera=camera, lidar_m=points_m)
     (ax,) = (ax for ax in draw.draw_frame(shown).axes if ax.images)
     (scatter,) = (x for x in ax.collections if isinstance(x, PathCollection))
