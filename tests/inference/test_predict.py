@@ -57,10 +57,6 @@ def _predict(setup, num_devices):
     return evaluation.predict(setup.variables, progress=False)
 
 
-def _saved(setup):
-    return SavedModel(setup.config, setup.records.grid, setup.variables)
-
-
 def _assert_same(actual, expected):
     np.testing.assert_array_equal(actual.frame, expected.frame)
     np.testing.assert_array_equal(actual.cls, expected.cls)
@@ -73,7 +69,8 @@ def test_eight_devices_and_a_detector_predict_the_same_as_one(setup):
     assert set(expected.frame) == set(range(5))
     assert len(expected) > 50
     _assert_same(_predict(setup, 8), expected)
-    detector = Detector(_saved(setup), score_threshold=0.45)
+    saved = SavedModel(setup.config, setup.records.grid, setup.variables)
+    detector = Detector(saved, score_threshold=0.45)
     alone = predict_dataset(detector, setup.records, setup.frames, 3, progress=False)
     _assert_same(alone, expected)
 
@@ -91,9 +88,7 @@ def test_scores_during_training_name_their_protocol(setup):
     # The loss of eight devices is the mean of the losses of single frames.
     table = make_table(setup.records, setup.frames, max_objects=30)
     one_by_one = LoaderOptions(1, shuffle=False, num_epochs=1, num_threads=0)
-    grid = models.map_grid(
-        setup.records.grid, setup.model, setup.config.data.azimuth_mapping
-    )
+    grid = models.map_grid(setup.records.grid, setup.model, "true")
     names = ("focal", "gwd", "weighted_sum")
 
     @jax.jit
@@ -102,9 +97,8 @@ def test_scores_during_training_name_their_protocol(setup):
         terms = detection_loss(maps, batch, grid, setup.config.loss)[1]
         return jnp.stack([terms[name] for name in names])
 
-    expected = [
-        terms_of(setup.variables, batch) for batch in make_loader(table, one_by_one)
-    ]
+    batches = make_loader(table, one_by_one)
+    expected = [terms_of(setup.variables, batch) for batch in batches]
     found = [scores.values[f"test/{name}"] for name in names]
     np.testing.assert_allclose(found, np.mean(expected, 0), rtol=1e-4)
     assert scores.values["test/loss"] == pytest.approx(4.0)
