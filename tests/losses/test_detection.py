@@ -79,7 +79,6 @@ def case(request, cases):
     # The reference differentiates with respect to probabilities.
     slope = np.moveaxis(heatmap.astype(np.float64) * (1 - heatmap), 1, -1)
     return {
-        "name": name,
         "want": want,
         "total": float(total),
         "parts": {k: float(v) for k, v in parts.items()},
@@ -92,9 +91,8 @@ def case(request, cases):
 def windows(maps, case, fill):
     """13 x 13 bins around each object in its class: `[P, 13, 13]`."""
     want = case["want"]
-    padded = np.pad(
-        maps, [(0, 0), (0, 0), (6, 6), (6, 6)], mode="constant", constant_values=fill
-    )
+    margins = [(0, 0), (0, 0), (6, 6), (6, 6)]
+    padded = np.pad(maps, margins, constant_values=fill)
     found = []
     for frame, row in want["patch_frame_object"].astype(int):
         x, y = want["boxes"][frame, row, :2].astype(np.float64)
@@ -133,9 +131,8 @@ def test_gradients_of_the_released_code(case):
     stats = want["grad_total_heatmap_channel_stats"]  # mean, std, min, max
     for column, function in enumerate((np.mean, np.std, np.min, np.max)):
         found = function(case["grad_heatmap"].astype(np.float64), (2, 3))
-        np.testing.assert_allclose(
-            found, stats[..., column], rtol=1e-4, atol=1e-5 * np.abs(stats).max()
-        )
+        atol = 1e-5 * np.abs(stats).max()
+        np.testing.assert_allclose(found, stats[..., column], rtol=1e-4, atol=atol)
     if not len(want["patch_frame_object"]):
         np.testing.assert_array_equal(case["grad_params"], 0)
         return
@@ -194,9 +191,8 @@ def test_parts_weigh_as_asked_whatever_their_size():
     assert float(total) == pytest.approx(4)
     sizes = [float(parts[p]) for p in PARTS]
     weights = {p: w / s for p, w, s in zip(PARTS, (2, 1, 1), sizes, strict=True)}
-    (plain, parts), plain_grad = loss_and_grad(
-        maps, batch, weights=weights, normalize=False
-    )
+    options = {"weights": weights, "normalize": False}
+    (plain, parts), plain_grad = loss_and_grad(maps, batch, **options)
     assert float(plain) == pytest.approx(4)
     assert float(parts["weighted_sum"]) == pytest.approx(4)
     chex.assert_trees_all_close(grad, plain_grad, atol=1e-6)
@@ -235,11 +231,12 @@ def test_bfloat16_maps_are_compared_in_float32():
 def test_normalized_yaw_ignores_the_length_of_the_vector():
     maps, batch = small_scene(np.random.default_rng(6))
     longer = maps.replace(box_params=maps.box_params.at[..., 6:].multiply(2.5))
-    gwd = [
-        float(loss_and_grad(m, batch, normalize_yaw=True)[0][1]["gwd"])
-        for m in (maps, longer)
-    ]
-    raw = [float(loss_and_grad(m, batch)[0][1]["gwd"]) for m in (maps, longer)]
+
+    def gwd_of(**options):
+        found = (loss_and_grad(m, batch, **options) for m in (maps, longer))
+        return [float(parts["gwd"]) for (_, parts), _ in found]
+
+    gwd, raw = gwd_of(normalize_yaw=True), gwd_of()
     assert gwd[0] == pytest.approx(gwd[1], rel=1e-5)
     assert abs(raw[0] - raw[1]) > 1e-3
     zero = maps.replace(box_params=maps.box_params.at[..., 6:].set(0))

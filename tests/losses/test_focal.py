@@ -9,10 +9,8 @@ from radejax.losses import focal as F
 GRID = RadarGrid.reduced(num_doppler=4, num_range=24, num_elevation=4, num_azimuth=16)
 C = 3
 
-heatmap = jax.jit(
-    F.gaussian_heatmap,
-    static_argnames=("grid", "num_classes", "sigma_mode", "sigma_bins"),
-)
+_STATIC = ("grid", "num_classes", "sigma_mode", "sigma_bins")
+heatmap = jax.jit(F.gaussian_heatmap, static_argnames=_STATIC)
 
 
 def objects(cells, sizes=((4.0, 2.0),)):

@@ -9,11 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.models.deformable_attention import (
-    DeformableAttention,
-    Queries,
-    lifted_attention,
-)
+from radejax.models import deformable_attention as attention
+from radejax.models.deformable_attention import DeformableAttention
 
 from .plain_attention import plain_attention
 
@@ -51,11 +48,11 @@ def test_samples_by_hand():
         (np.nan, np.nan): 0.0,
     }
     n = len(places)
-    out = lifted_attention(
+    out = attention.lifted_attention(
         value.reshape(1, 2, 3, 1, 1),
         jnp.zeros((1, n, 1, 1, 2)),
         jnp.zeros((1, n, 1, 1)),
-        Queries(
+        attention.Queries(
             jnp.ones((1, n, 1)),
             jnp.asarray(list(places)).reshape(1, n, 1, 2),
             jnp.full((1, n, 1), 2.0),

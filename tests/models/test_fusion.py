@@ -15,9 +15,8 @@ from radejax.models.options import FusionOptions
 from .plain_attention import plain_attention
 
 B, R, A, C, E, D, H, W = 2, 4, 3, 8, 3, 5, 6, 7
-SMALL = FusionOptions(
-    num_heads=2, num_points=3, num_elevation=E, necks=False, chunk_size=5
-)
+SIZES = {"num_heads": 2, "num_points": 3, "num_elevation": E, "chunk_size": 5}
+SMALL = FusionOptions(necks=False, **SIZES)
 
 
 def fusion(**changes):
@@ -98,9 +97,8 @@ def test_fusion_follows_the_equations(weighting, gate, out_of_view, batch_geomet
     args = inputs(batch_geometry=batch_geometry)
     variables = variables_of(module, args)
     fused = jax.jit(module.apply)(variables, *args)
-    np.testing.assert_allclose(
-        fused, by_the_formulas(module, variables, *args), atol=2e-5
-    )
+    expected = by_the_formulas(module, variables, *args)
+    np.testing.assert_allclose(fused, expected, atol=2e-5)
     gate_width = C if gate == "channel" else 1
     assert variables["params"]["gate_out"]["bias"].shape == (gate_width,)
 
