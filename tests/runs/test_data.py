@@ -76,16 +76,12 @@ def test_paths_are_absolute_and_simulations_named_by_their_config(
 
 def test_frames_are_projected_beside_their_data_once(root, monkeypatch, capsys, caplog):
     monkeypatch.chdir(root.parent)
+    bins = _config("sim").replace(model={"doppler_bins": 64})
+    nothing = _config("sim", batch_size=4, visibility=())
     for wrong, message in (
-        (
-            _config("sim").replace(model={"doppler_bins": 64}),
-            "doppler_bins is 64, expected 16, as the rad",
-        ),
+        (bins, "doppler_bins is 64, expected 16, as the rad"),
         (_config("sim", batch_size=5), "4 frames are fewer than one batch"),
-        (
-            _config("sim", batch_size=4, visibility=()),
-            "4 frames of the train split have no object of",
-        ),
+        (nothing, "4 frames of the train split have no object of"),
     ):
         with pytest.raises(UserError, match=message):
             _open(wrong)
@@ -93,9 +89,8 @@ def test_frames_are_projected_beside_their_data_once(root, monkeypatch, capsys, 
     config = _config("sim", batch_size=4)
     with caplog.at_level("INFO", "radejax"):
         data = _open(config)
-        assert re.search(
-            r"input: 0\.64\d ± 0\.04\d in the frames to train", caplog.text
-        )
+        text = r"input: 0\.64\d ± 0\.04\d in the frames to train"
+        assert re.search(text, caplog.text)
         assert "the network sees" not in caplog.text
     assert data.options.roots == (str(root),)
     assert data.options.records == str(root / "records")

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import pathlib
 from types import SimpleNamespace
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -30,12 +31,10 @@ DATA = {
 def _shuffled(paths, seed):
     """Frames 0, 1, ... with images (and calibrations) of these names, shuffled."""
     blank = {field.name: None for field in dataclasses.fields(Frame)}
-    frames = [
-        Frame(
-            **blank | {"name": str(i), "camera_path": p, "camera_calibration_path": p}
-        )
-        for i, p in enumerate(paths)
-    ]
+    frames = []
+    for i, path in enumerate(paths):
+        fields = {"camera_path": path, "camera_calibration_path": path}
+        frames.append(Frame(**blank | fields | {"name": str(i)}))
     data = SimpleNamespace(camera=True, split=lambda _: frames)
     return evaluate.with_shuffled_images(data, "test", seed)
 
@@ -62,9 +61,8 @@ def test_images_of_fewer_than_two_frames_cannot_be_shuffled():
 def test_a_cut_when_scoring_is_a_cut_when_decoding():
     """What lies below the cut takes no part in NMS and costs no row of those above."""
     rng = np.random.default_rng(0)
-    grid = RadarGrid.reduced(
-        num_doppler=4, num_range=24, num_elevation=4, num_azimuth=16
-    )
+    bins = {"num_range": 24, "num_elevation": 4, "num_azimuth": 16}
+    grid = RadarGrid.reduced(num_doppler=4, **bins)
     params = rng.normal((0, 0, 0, 5, 3, 2, 0, 1), 1, (2, 24, 16, 8))
     maps = DetectionMaps(
         jnp.asarray(rng.normal(-5, 2, (2, 24, 16, 5)), jnp.float32),
@@ -115,20 +113,17 @@ def evaluated(tmp_path, monkeypatch):
         saved = {"run": "run", "variables": None, "step": 3}
         saved["check_input"] = lambda *found: written.update(compared=found)
         loaded = SimpleNamespace(config=Config(), **saved)
-        evaluation = SimpleNamespace(report=lambda *_, **named: written.update(named))
+        make_evaluation = mock.Mock()
         monkeypatch.setattr(evaluate, "load_model", lambda *_, **__: loaded)
 
         def data_of_run(saved, other):
             return saved.config.replace(data=other or {}), data
 
-        def make_evaluation(*_, **named):
-            written.update(named)
-            return evaluation
-
         monkeypatch.setattr(evaluate, "data_of_run", data_of_run)
         monkeypatch.setattr(evaluate, "Evaluation", make_evaluation)
         evaluate.evaluate_run(tmp_path, **options)
-        return written
+        report = make_evaluation.return_value.report.call_args
+        return written | make_evaluation.call_args.kwargs | report.kwargs
 
     return run
 

@@ -32,9 +32,8 @@ def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
         said_before.append(caplog.text)
         return SimpleNamespace(step=1), True
 
-    simulation = SimulationOptions(
-        output="projection", train_sequences=1, test_sequences=0, frames_per_sequence=2
-    )
+    sizes = {"train_sequences": 1, "test_sequences": 0, "frames_per_sequence": 2}
+    simulation = SimulationOptions(output="projection", **sizes)
     root = simulate_dataset(simulation, tmp_path / "data", progress=False)
     config = Config().replace(
         model={"doppler_bins": 16, "elevation_bins": 9},
@@ -49,17 +48,15 @@ def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
 
 
 def test_frames_labels_and_frozen_weights_tell_whether_a_run_is_the_same():
-    def stays(keys, frozen=None, x=1.0, cls="Sedan"):
-        box, classes = np.array([[x, 2, 3, 4, 2, 1.5, 0]]), np.array([cls])
+    def stays(keys):
+        box, classes = np.array([[1, 2, 3, 4, 2, 1.5, 0]]), np.array(["Sedan"])
         frames = [SimpleNamespace(key=key, boxes=box, classes=classes) for key in keys]
-        return experiment._invariants(frames, frozen)
+        return experiment._invariants(frames, None)
 
-    first = stays(["1/a", "1/b"])
+    first, other = stays(["1/a", "1/b"]), stays(["1/a", "1/c"])
     assert first == stays(["1/a", "1/b"])
-    assert first["frames to train on"] == 2
-    assert (
-        first["sha256 of their keys"] != stays(["1/a", "1/c"])["sha256 of their keys"]
-    )
+    assert first["frames to train on"] == other["frames to train on"] == 2
+    assert first["sha256 of their keys"] != other["sha256 of their keys"]
 
 
 @pytest.mark.slow
@@ -110,10 +107,8 @@ def test_a_run_of_two_frames(tmp_path, monkeypatch, caplog, one_device):
     detector = Detector.from_workdir(folder, score_threshold=0.0, batch_sizes=(8,))
     count, _ = detect_files(detector, find_inputs(detector, [root]), out)
     assert (count["frames"], count["repeated"]) == (8, 4)
-    assert (
-        detector.saved.usual_input
-        == json.loads((folder / "run.json").read_text())["input"]
-    )
+    info = json.loads((folder / "run.json").read_text())
+    assert detector.saved.usual_input == info["input"]
     assert "in the training: detections" not in caplog.text
     origin = detector.saved.identity
     assert origin["run"] == "run"
@@ -147,12 +142,10 @@ def test_a_work_folder_keeps_its_config_and_rejects_another(tmp_path, caplog):
         with claimed(tmp_path, kept):
             assert Config(**json.loads((tmp_path / "config.json").read_text())) == kept
     (tmp_path / "checkpoints" / "1").mkdir(parents=True)
+    text = r"config\.seed is 0 there and 5 here; "
+    text += r"config\.train\.batch_size is 10 there and 3 here.*--workdir"
     with (
-        pytest.raises(
-            UserError,
-            match=r"config\.seed is 0 there and 5 here; "
-            r"config\.train\.batch_size is 10 there and 3 here.*--workdir",
-        ),
+        pytest.raises(UserError, match=text),
         claimed(tmp_path, kept.replace(seed=5, train={"batch_size": 3})),
     ):
         pass

@@ -43,9 +43,8 @@ def test_samples_are_drawn_with_their_augmentation(tmp_path, monkeypatch):
 
 
 def test_bins_out_of_view_and_frames_without_image_do_not_count():
-    grid = RadarGrid.reduced(
-        num_doppler=2, num_range=2, num_elevation=2, num_azimuth=2, max_range_m=20.0
-    )
+    names = ("num_doppler", "num_range", "num_elevation", "num_azimuth")
+    grid = RadarGrid.reduced(**dict.fromkeys(names, 2), max_range_m=20.0)
     first = np.array([[0.0, 0.2], [0.4, 0.0]])
     second = np.array([[0.0, 0.6], [0.0, 0.0]])
     nothing = np.zeros((2, 2))

@@ -14,11 +14,7 @@ from radejax.runs.data import located, simulate_missing
 
 from .. import small_models as small
 
-SETTINGS = {
-    "kind": "onnx",
-    "radar_input": "projection",
-    "batch_size": None,
-}
+SETTINGS = {"kind": "onnx", "radar_input": "projection", "batch_size": None}
 
 
 @pytest.fixture(scope="module")
