@@ -28,9 +28,8 @@ def test_default_has_every_weather_in_training_and_several_held_out():
     assert set(train) == set(WEATHERS) == set(KRADAR_WEATHERS)
     assert {environment for environment, *_ in CONDITIONS} == set(ENVIRONMENTS)
     last = config.train_sequences + config.test_sequences
-    held_out = [
-        config.conditions(n)[2] for n in range(config.train_sequences + 1, last + 1)
-    ]
+    test = range(config.train_sequences + 1, last + 1)
+    held_out = [config.conditions(n)[2] for n in test]
     assert len(set(held_out)) >= 4
 
 
