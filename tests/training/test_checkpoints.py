@@ -21,9 +21,8 @@ from radejax.training.checkpoints import Checkpoints, array_checksums
 from .. import processes
 
 # Restoring of corrupted files ends orbax's event loop while others are still read.
-pytestmark = pytest.mark.filterwarnings(
-    "ignore::pytest.PytestUnraisableExceptionWarning"
-)
+_UNRAISABLE = "ignore::pytest.PytestUnraisableExceptionWarning"
+pytestmark = pytest.mark.filterwarnings(_UNRAISABLE)
 
 WEIGHTS = np.random.default_rng(0).random((16, 4), np.float32)
 
@@ -106,9 +105,8 @@ def test_the_best_is_kept(tmp_path):
     metrics = {2: 5.0, 4: 3.0}
     with Checkpoints(tmp_path, max_to_keep=1) as checkpoints:
         for step in range(1, 6):
-            checkpoints.save(
-                step, _state(step), iterator, info={}, best=metrics.get(step)
-            )
+            best = metrics.get(step)
+            checkpoints.save(step, _state(step), iterator, info={}, best=best)
             checkpoints.wait()
         assert checkpoints.steps() == [2, 5]
         assert checkpoints.best_step() == 2
@@ -255,9 +253,8 @@ def test_whole_files_with_other_weights_are_found(folder):
 
 def test_the_checksum_does_not_depend_on_the_placement():
     mesh = devices.make_mesh()
-    split = jax.sharding.NamedSharding(
-        mesh, jax.sharding.PartitionSpec(mesh.axis_names[0])
-    )
+    spec = jax.sharding.PartitionSpec(mesh.axis_names[0])
+    split = jax.sharding.NamedSharding(mesh, spec)
     assert mesh.size > 1
     state = {
         "w": WEIGHTS,
@@ -349,9 +346,8 @@ def test_processes_that_see_different_checkpoints_restore_the_same_one(tmp_path)
     for output, rows in zip(outputs, (slice(0, 8), slice(8, 16)), strict=True):
         found = json.loads(output.splitlines()[-1])
         assert found[:3] == [1, 16, 8]
-        np.testing.assert_allclose(
-            found[3:], [WEIGHTS.sum(), -WEIGHTS[rows].sum()], 1e-5
-        )
+        sums = [WEIGHTS.sum(), -WEIGHTS[rows].sum()]
+        np.testing.assert_allclose(found[3:], sums, 1e-5)
     assert [path.name for path in mine.iterdir()] == ["1"]
     moved = tmp_path / "mine_corrupted"
     assert sorted(path.name for path in moved.iterdir()) == ["2", "3"]

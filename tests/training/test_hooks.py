@@ -3,6 +3,7 @@
 import itertools
 import json
 from types import SimpleNamespace
+from unittest import mock
 
 import jax.numpy as jnp
 import pytest
@@ -35,24 +36,15 @@ def test_hooks_are_called_in_order_after_each_step():
 
 
 def test_the_loop_stops_between_steps_of_which_two_are_under_way(monkeypatch):
-    waited_for = []
-    monkeypatch.setattr(
-        loop.jax,
-        "block_until_ready",
-        lambda metrics: waited_for.append(float(metrics["loss"])),
-    )
-    answers = iter([False] * 5 + [True])
-    state = SimpleNamespace(step=0, seen=[])
-    state = loop.train(
-        state,
-        _step,
-        itertools.count(),
-        [],
-        num_steps=9,
-        should_stop=lambda: next(answers),
-    )
+    wait = mock.Mock()
+    monkeypatch.setattr(loop.jax, "block_until_ready", wait)
+    should_stop = mock.Mock(side_effect=[False] * 5 + [True])
+    state, batches = SimpleNamespace(step=0, seen=[]), itertools.count()
+    options = {"num_steps": 9, "should_stop": should_stop}
+    state = loop.train(state, _step, batches, [], **options)
     assert state.seen == [0, 1, 2, 3, 4]
-    assert waited_for == [0, 1, 2]  # from the third step on, for that two steps before
+    # From the third step on, for that two steps before.
+    assert [call.args[0]["loss"] for call in wait.call_args_list] == [0, 1, 2]
 
 
 def test_values_that_an_own_hook_returns_are_logged(tmp_path):
@@ -103,9 +95,8 @@ def test_waiting_for_data_is_warned_of_once(wait, tmp_path, monkeypatch, caplog)
             for hook in (throughput, bar, log):
                 hook(step, None, metrics)
             assert len(caplog.records) == min(step - 1, 1)
-    first, row, _ = map(
-        json.loads, (tmp_path / "metrics.jsonl").read_text().splitlines()
-    )
+    lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
+    first, row, _ = map(json.loads, lines)
     assert list(first) == ["step", "minutes", "focal", "learning_rate", "epoch"]
     assert (row["step"], row["focal"], row["epoch"], bar.n) == (2, 1.0, 0.2, 3)
     assert row["frames_per_s"] == pytest.approx(10 / 0.3)

@@ -39,9 +39,7 @@ ALL = [
         ("dinorade", "official", 6, 11, 1e-5, 5, "v2.1"),
     ],
 )
-def test_trainings_are_those_of_the_papers(
-    name, words, batch, epochs, floor, classes, labels
-):
+def test_trainings_of_the_papers(name, words, batch, epochs, floor, classes, labels):
     config = load_config(f"{name}:{words}")
     train = config.train
     assert (train.batch_size, train.num_epochs) == (batch, epochs)
@@ -123,9 +121,8 @@ def _shrink(config):
 @pytest.mark.parametrize(("name", "words"), ALL)
 def test_two_steps_of_every_config(name, words):
     config = _shrink(load_config(f"{name}:{words}"))
-    grid = RadarGrid.reduced(
-        num_doppler=5, num_range=8, num_elevation=4, num_azimuth=8, max_range_m=30.0
-    )
+    bins = {"num_doppler": 5, "num_range": 8, "num_elevation": 4, "num_azimuth": 8}
+    grid = RadarGrid.reduced(**bins, max_range_m=30.0)
     has_camera = isinstance(config.model, DinoRadeOptions)
     rng = np.random.default_rng(0)
     projection = rng.random((2, *grid.projection_shape)).astype(np.float16)
@@ -133,28 +130,17 @@ def test_two_steps_of_every_config(name, words):
     batch = jax.device_put(labeled_batch(projection, image))
     model = models.build(config.model)
     optimizer = make_optimizer(config.train, lambda _: 1e-3)
-    start = create_state(
-        drawn(model, *batch.model_inputs()),
-        optimizer,
-        use_ema=False,
-        is_frozen=getattr(model, "is_frozen", None),
-    )
-    step = jax.jit(
-        make_train_step(
-            model,
-            optimizer,
-            models.map_grid(grid, model, config.data.azimuth_mapping),
-            loss=config.loss,
-        )
-    )
+    variables = drawn(model, *batch.model_inputs())
+    is_frozen = getattr(model, "is_frozen", None)
+    start = create_state(variables, optimizer, use_ema=False, is_frozen=is_frozen)
+    grid = models.map_grid(grid, model, config.data.azimuth_mapping)
+    step = jax.jit(make_train_step(model, optimizer, grid, loss=config.loss))
     state = start
     for _ in range(2):
         state, metrics = step(state, batch, jax.random.key(1))
     assert (int(state.step), int(metrics["skipped"])) == (2, 0)
     chex.assert_tree_all_finite((state.params, metrics))
-    changed = jax.tree.map(
-        lambda a, b: bool((a != b).any()), state.params, start.params
-    )
+    changed = jax.tree.map(lambda a, b: (a != b).any(), state.params, start.params)
     assert np.mean(jax.tree.leaves(changed)) > 0.9
     chex.assert_trees_all_equal(state.frozen, start.frozen)
     assert bool(start.frozen) == (has_camera and config.model.image.freeze)

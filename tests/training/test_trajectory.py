@@ -35,8 +35,6 @@ SEED = 1234
 LOSSES = ("focal", "gwd", "smooth_l1", "grad_norm")
 STEPS_PER_EPOCH = 3
 
-Measured = dict[str, np.ndarray]
-
 
 @pytest.fixture(scope="module")
 def file(golden):
@@ -69,9 +67,9 @@ def cube_of(frame, boxes, classes):
 def frames(file):
     """The six frames, float32 as the authors' network sees them."""
     boxes, classes = file["boxes"], file["classes"].astype(np.int32)
-    cubes = np.stack(
-        [cube_of(i, boxes[i][x >= 0], x[x >= 0]) for i, x in enumerate(classes)]
-    )
+    kept = classes >= 0
+    parts = [(boxes[i][rows], classes[i][rows]) for i, rows in enumerate(kept)]
+    cubes = np.stack([cube_of(i, *part) for i, part in enumerate(parts)])
     assert zlib.crc32(cubes.tobytes()) == file["radenet/cube_crc32"]
     return Batch(
         projection=np.ascontiguousarray(np.moveaxis(cubes, 1, -1)),
@@ -91,17 +89,12 @@ def train(config, model, variables, batch, num_steps):
     optimizer = make_optimizer(options, schedule)
     grid = models.map_grid(RadarGrid.kradar(), model, config.data.azimuth_mapping)
     mesh = devices.make_mesh(1)
-    state = create_state(
-        variables,
-        optimizer,
-        use_ema=False,
-        is_frozen=getattr(model, "is_frozen", None),
-    )
+    is_frozen = getattr(model, "is_frozen", None)
+    state = create_state(variables, optimizer, use_ema=False, is_frozen=is_frozen)
     placement = devices.state_sharding(state, mesh, "replicated")
     state = jax.device_put(state, placement)
-    step = make_train_step(
-        model, optimizer, grid, loss=config.loss, decoding=config.decode
-    )
+    options = {"loss": config.loss, "decoding": config.decode}
+    step = make_train_step(model, optimizer, grid, **options)
     step = jax.jit(step, donate_argnums=0, out_shardings=(placement, None))
     measured, rng = [], jax.random.key(1)
     for i in range(num_steps):
@@ -110,9 +103,8 @@ def train(config, model, variables, batch, num_steps):
         state, metrics = step(state, devices.put_batch(part, mesh), rng)
         rate = schedule(np.int32(i))
         measured.append({"lr": rate} | {name: metrics[name] for name in LOSSES})
-    return state, {
-        name: np.array([float(m[name]) for m in measured]) for name in measured[0]
-    }
+    columns = ([float(x) for x in row.values()] for row in measured)
+    return state, dict(zip(measured[0], np.array([*columns]).T, strict=True))
 
 
 def check_steps(measured, fixture, limits):
@@ -149,10 +141,8 @@ def check_stats(tensors, fixture, limits):
 def test_radenet_trains_as_released(file, frames, make):
     config = load_config("radenet:official")
     model = models.build(config.model)
-    tensors = {
-        n: make.seeded_tensor(n, s)
-        for n, s in radenet_torch.torch_shapes(model).items()
-    }
+    shapes = radenet_torch.torch_shapes(model)
+    tensors = {n: make.seeded_tensor(n, s) for n, s in shapes.items()}
     variables = load_torch(tensors).variables
     state, measured = train(config, model, variables, frames, 12)
     maps = jax.jit(model.apply)(state.eval_variables, frames.projection[:1])
