@@ -19,9 +19,8 @@ def color_figure(color):
 
 def test_gif_has_every_frame_in_order(tmp_path):
     colors = ["white", PREDICTION.color, "black"]
-    path = recordings.animate(
-        (color_figure(c) for c in colors), tmp_path / "a.gif", frames_per_second=5
-    )
+    figures = map(color_figure, colors)
+    path = recordings.animate(figures, tmp_path / "a.gif", frames_per_second=5)
     with Image.open(path) as gif:
         assert gif.n_frames == 3
         assert gif.info["duration"] == 200
