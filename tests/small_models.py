@@ -139,9 +139,8 @@ def detector_with_output(*, num_frames: int = 1, **options: Any) -> Detector:
 def saved(kind: str = "radar", **changes: Any) -> SavedModel:
     """An untrained model; `changes` are fields of its config, dots as "__"."""
     config = {"radar": radar_config, "camera": camera_config}[kind]()
-    config = config.with_fields(
-        {name.replace("__", "."): value for name, value in changes.items()}
-    )
+    fields = {name.replace("__", "."): value for name, value in changes.items()}
+    config = config.with_fields(fields)
     variables = _variables(kind, config.data.num_frames)
     return SavedModel(config, small_grid(), variables)
 

@@ -8,15 +8,9 @@ import re
 
 import pytest
 
+from radejax import config as configs
 from radejax import models
-from radejax.config import (
-    Config,
-    config_file,
-    config_name,
-    load_config,
-    load_module,
-    with_texts,
-)
+from radejax.config import Config, load_config, with_texts
 from radejax.core.errors import UserError
 from radejax.detection.decode import DecodeOptions
 from radejax.geometry.radar_grid import RadarGrid
@@ -34,9 +28,9 @@ WHOLE = load_config("quickstart_fusion").with_fields(
         "train.max_steps": 10,
         "train.gradient_clip_norm": 1.0,
         "train.ema_decay": 0.9,
-        **dict.fromkeys(
-            (f"data.{x}" for x in ("labels", "records", "embeddings")), "x"
-        ),
+        "data.labels": "x",
+        "data.records": "x",
+        "data.embeddings": "x",
         "data.image_backbone": "x",
         "data.camera_calibration": "x",
         "data.release": "rpc",
@@ -90,21 +84,21 @@ def test_a_value_that_its_type_allows_is_named(field, value):
     _check_rejected({field: value}, rf"{re.escape(field)}(\[\d+\])* is ")
 
 
+BEST = {"train.best_metric": "map_3d_iou70", "train.evaluate_every_epochs": 1}
+
+
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
         ({"train.num_epoch": 3}, "train.num_epoch is not a field; did you mean conf"),
         ({"trian.batch_size": 3}, "trian is not a field; did you mean config.train"),
-        (
-            {"train.best_metric": "map_3d_iou70", "train.evaluate_every_epochs": 1},
-            "train.best_metric is 'map_3d_iou70', expected one of .*map_bev_iou30",
-        ),
+        (BEST, "train.best_metric is 'map_3d_iou70', expected one of .*map_bev_iou30"),
         ({"model.doppler_bins": 64}, "model.doppler_bins is 64, expected 16, as conf"),
         ({"model.num_groups": 64}, r"model.widths\[0\] is 32, expected a multiple of"),
         ({"classes": ("Sedan",)}, "model.num_classes is 5, expected 1, the number of"),
         (
             {"train.learning_rate": 1e-5},
-            "train.final_learning_rate is .*, expected at most config.train.learning_rate",
+            "train.final_learning_rate is .*, expected at mo",
         ),
     ],
 )
@@ -147,8 +141,8 @@ def test_other_user_errors(tmp_path):
         (lambda: with_texts(plain, {"train.batchsize": "1"}), "train.batch_size?"),
         (lambda: with_texts(plain, {"train.batch_size": "2.5"}), "is 2.5, expected"),
         (
-            lambda: with_texts(plain, {"train.learning_rate": "((((" * 300}),
-            "expected a number",
+            lambda: with_texts(plain, {"train.ema_decay": "((((" * 300}),
+            "expected a num",
         ),
     ):
         with pytest.raises(UserError, match=message):
@@ -159,21 +153,19 @@ def test_other_user_errors(tmp_path):
 
 
 def _words(name):
-    module = load_module(CONFIGS / f"{name}.py")
+    module = configs.load_module(CONFIGS / f"{name}.py")
     if name.startswith("quickstart"):
         words = ["radar", "radar,short", "silhouettes", "silhouettes,short"]
         words += ["pretrained", "resnet50", "long"]
         return ["", "short"] + words * name.endswith("fusion")
-    groups = [
-        ["", *getattr(module, names, ())]
-        for names in ("VARIANTS", "PRESETS", "CLASS_SETS")
-    ]
+    kinds = ("VARIANTS", "PRESETS", "CLASS_SETS")
+    groups = [["", *getattr(module, names, ())] for names in kinds]
     return [",".join(filter(None, words)) for words in itertools.product(*groups)]
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in CONFIGS.glob("*.py")))
 def test_every_preset_can_be_built_and_stored_as_json(name):
-    assert config_file(name).samefile(CONFIGS / f"{name}.py")
+    assert configs.config_file(name).samefile(CONFIGS / f"{name}.py")
     choices = _words(name)
     for words in choices:
         config = load_config(f"{name}:{words}")
@@ -228,8 +220,8 @@ def test_texts_are_set_together_and_models_have_the_options_of_their_class():
 
 
 def test_names_of_runs():
-    assert config_name("configs/quickstart.py") == "quickstart"
-    assert config_name("a/b/radenet.py:stem,sedan") == "radenet-stem-sedan"
+    assert configs.config_name("configs/quickstart.py") == "quickstart"
+    assert configs.config_name("a/b/radenet.py:stem,sedan") == "radenet-stem-sedan"
 
 
 def test_data_paths_differ_from_machine_to_machine():

@@ -44,12 +44,8 @@ def _case(kind):
     variables = small_models.drawn(model, *inputs)
     # Gradient descent, because the optimizer's work on each device is that of one device.
     optimizer = optax.sgd(1e-3)
-    state = create_state(
-        variables,
-        optimizer,
-        use_ema=False,
-        is_frozen=getattr(model, "is_frozen", None),
-    )
+    is_frozen = getattr(model, "is_frozen", None)
+    state = create_state(variables, optimizer, use_ema=False, is_frozen=is_frozen)
     grid = models.map_grid(small_models.small_grid(), model, "true")
     step = make_train_step(model, optimizer, grid, loss=config.loss)
     return model, batch, state, step
@@ -144,9 +140,8 @@ def test_devices_share_the_work_of_inference_and_gather_only_detections():
     programs = []
     for num_devices in (1, 4):
         mesh = devices.make_mesh(num_devices)
-        detector = small_models.detector(
-            "camera", sharding=devices.batch_sharding(mesh)
-        )
+        sharding = devices.batch_sharding(mesh)
+        detector = small_models.detector("camera", sharding=sharding)
         arguments = detector.variables, *jax.tree.map(detector.put, inputs), settings
         program = detector._run.lower(*arguments).compile()
         programs.append((program, program(*arguments)))

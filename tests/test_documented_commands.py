@@ -19,11 +19,7 @@ from radejax.cli.train import train
 from radejax.config import load_config, with_texts
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
-PAGES = [
-    ROOT / "README.md",
-    ROOT / "CONTRIBUTING.md",
-    *sorted((ROOT / "docs").glob("*.md")),
-]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md"))]
 PROGRAMS = ("python", "python3", "radejax")
 
 # Scripts; the other files are modules that they import.

@@ -93,9 +93,8 @@ def opened(workdir):
 def data(tmp_path_factory, make, one_device):
     root = tmp_path_factory.mktemp("fusion")
     (root / "dinov3").mkdir()
-    return _Data(
-        root / "data", make.write_tiny_folder(root / "dinov3"), root, one_device
-    )
+    backbone = make.write_tiny_folder(root / "dinov3")
+    return _Data(root / "data", backbone, root, one_device)
 
 
 @pytest.fixture(scope="module")

@@ -67,9 +67,8 @@ def _realistic_rows():
         for seeds in stored["ap"].values():
             names = [name for name in seeds["seed 0"] if name.startswith(protocol)]
             aps = [[seed[name] for seed in seeds.values()] for name in names]
-            means = [
-                f"{statistics.mean(x):.1f} ± {statistics.stdev(x):.1f}" for x in aps
-            ]
+            spreads = [(statistics.mean(x), statistics.stdev(x)) for x in aps]
+            means = [f"{mean:.1f} ± {std:.1f}" for mean, std in spreads]
             yield from (" ".join(means), *means)
         cfar = stored["cfar"]["difference"].items()
         yield _row(x["CFAR"] for name, x in cfar if name.startswith(protocol))
@@ -88,10 +87,8 @@ def _robustness_rows():
     models = stored["augmentation"]["ap"].values()
     for name in next(iter(models)):
         row = _row(ap[name] for ap in models if name in ap)
-        yield from (
-            f"{name} {row}",
-            f"{name.split()[0]} {row}",
-        )  # whole numbers are no APs
+        yield f"{name} {row}"
+        yield f"{name.split()[0]} {row}"  # whole numbers are no APs
 
 
 def _calibration_rows():
@@ -144,9 +141,8 @@ def _printed(page):
                 cells = list(zip(map(str.strip, header), row, strict=True))
                 for name, cell in cells:
                     yield from APS_OF_PAPERS.findall(cell) if name in QUOTED else ()
-                own = " ".join(
-                    x for name, x in cells if name not in (*QUOTED, "variant")
-                )
+                left_out = (*QUOTED, "variant")
+                own = " ".join(x for name, x in cells if name not in left_out)
                 yield from DIFFERENCE.findall(own)
                 if numbers := NUMBER.findall(DIFFERENCE.sub("", own)):
                     yield " ".join([*re.findall(r"`(\w+)`", row[0]), *numbers])

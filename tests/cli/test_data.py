@@ -3,6 +3,7 @@
 import json
 import types
 import zipfile
+from unittest import mock
 
 import click.testing
 import numpy as np
@@ -89,15 +90,13 @@ def test_frames_are_checked_preprocessed_and_drawn(disks, tmp_path):
 
 
 def test_the_full_size_keeps_the_radar_of_the_config(tmp_path, monkeypatch):
-    made = []
-    monkeypatch.setattr(
-        "radejax.simulate", lambda options, *_, **__: made.append(options)
-    )
+    simulate = mock.Mock()
+    monkeypatch.setattr("radejax.simulate", simulate)
     radar = {"preset": "ideal", "noise_db": 100.0, "azimuth_elements": 5.0}
     config = types.SimpleNamespace(simulation=SimulationOptions(radar=radar))
     monkeypatch.setattr("radejax.load_config", lambda _: config)
     run("simulate", "--config", "own", "--full-size", "--out", tmp_path / "out")
-    (options,) = made
+    options = simulate.call_args.args[0]
     assert dict(options.radar) == {"preset": "ideal", "noise_db": 100.0}
 
 
