@@ -300,9 +300,8 @@ def test_what_a_reader_forgets_is_named(tmp_path, monkeypatch):
 @pytest.mark.parametrize("is_flat", [False, True])
 def test_written_folders_are_read(is_flat, tmp_path, monkeypatch):
     """Also those of a radar that measures only range and azimuth, with one bin per axis."""
-    (written,) = (
-        block for block in _blocks("own_radar.md", "py") if "write_splits" in block
-    )
+    blocks = _blocks("own_radar.md", "py")
+    (written,) = (block for block in blocks if "write_splits" in block)
     if is_flat:
         axes = r"(elevation_rad|doppler_mps)=.*"
         written, count = re.subn(axes, r"\1=[0.0],", written)

@@ -137,9 +137,8 @@ def test_lidar_points_are_drawn_in_the_radar_frame(root, tmp_path, monkeypatch, 
     draw = mock.Mock(wraps=radejax.draw_frame)
     monkeypatch.setattr(radejax, "draw_frame", draw)
     _run("1", f"{root},{disk}", "--lidar")
-    np.testing.assert_allclose(
-        draw.call_args.args[0].lidar_m, [[30 - 2.54, 2 + 0.3, 1]]
-    )
+    (scene,) = draw.call_args.args
+    np.testing.assert_allclose(scene.lidar_m, [[30 - 2.54, 2 + 0.3, 1]])
     assert frame.radar_from_lidar_m[:2] == (-2.54, 0.3)
     text = _run("1", f"{root},{disk}", "--lidar", "--slices", code=2).output
     assert "--slices shows no LiDAR points" in text

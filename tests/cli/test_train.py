@@ -15,10 +15,7 @@ from ..commands import run
     ("arguments", "message"),
     [
         (["--data", "one", "two"], "unexpected extra argument (two)"),
-        (
-            ["--num-processes=2", "--process-id=1"],
-            "give --coordinator HOST:PORT, --num",
-        ),
+        (["--num-processes=2", "--process-id=1"], "give --coordinator HOST:PORT,"),
         (["--sequences=1,x"], "'1,x', expected 1,5,58"),
         (["--weather=fog", "--weather=mist"], "config.data.weather is ('fog', 'mist')"),
         (["--config.train.batchsize=4"], "did you mean config.train.batch_size?"),

@@ -184,17 +184,11 @@ def test_files_of_all_layouts_are_read(
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (
-            {"rx_m": [(0, 0, 0), (0, 0.5, 0)]},
-            "rx_m is in meters; its spacing is 0.5, exp",
-        ),
+        ({"rx_m": [(0, 0, 0), (0, 0.5, 0)]}, "rx_m is in meters; its spacing is 0.5,"),
         ({"rx_m": [(0.0, 0.0)]}, r"radar.rx_m\[0\] is missing"),
         ({"azimuth_rad": np.arange(-50.0, 51.0)}, "3.14159 radians .* from -50 to 50"),
         ({"carrier_hz": 77.0}, "carrier_hz is 77.0, expected a number of at least"),
-        (
-            {"slope_hz_per_s": 30.0},
-            "is 30.0, expected Hz per second .30 MHz/us are 30e12",
-        ),
+        ({"slope_hz_per_s": 30.0}, "is 30.0, expected Hz per second .30 MHz/us are"),
         ({"sample_rate_hz": 10_000.0}, "_rate_hz is 10000.0, expected at least 3.2e"),
     ],
 )
@@ -207,16 +201,8 @@ def test_wrong_radars_are_named(change, message):
 @pytest.mark.parametrize(
     ("num_tx", "dtype", "message"),
     [
-        (
-            2,
-            complex,
-            r"samples is \(16, 2, 4, 64\), expected \(16, 3, 4, 64\): num_chi",
-        ),
-        (
-            3,
-            np.int16,
-            "type of samples is 'int16', expected complex, as radar.is_complex",
-        ),
+        (2, complex, r"samples is \(16, 2, 4, 64\), expected \(16, 3, 4, 64\):"),
+        (3, np.int16, "type of samples is 'int16', expected complex, as radar.is_comp"),
     ],
 )
 def test_samples_of_other_radars_are_named(num_tx, dtype, message):

@@ -79,9 +79,8 @@ def test_mirrored_camera_sees_the_mirrored_world_in_the_mirrored_image(points, k
     points = np.array(points)
     camera = CAMERA.camera(kind)
     before, depth = project(points, camera)
-    after, depth_after = project(
-        points * (1, -1, 1), augmentation.mirror_camera(camera)
-    )
+    mirrored = augmentation.mirror_camera(camera)
+    after, depth_after = project(points * (1, -1, 1), mirrored)
     np.testing.assert_allclose(depth_after, depth, rtol=1e-12)
     np.testing.assert_allclose(after[:, 1], before[:, 1], rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(after[:, 0], 1280 - before[:, 0], rtol=1e-9, atol=1e-9)

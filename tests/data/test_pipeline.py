@@ -103,10 +103,8 @@ def test_order_depends_only_on_the_seed(loader):
 
 def frames_of_processes(loader, count, **options):
     """Frames of the batches of every process."""
-    made = [
-        loader(process_index=i, process_count=count, **options) for i in range(count)
-    ]
-    return [frames_of(one) for one in made]
+    make = functools.partial(loader, process_count=count, **options)
+    return [frames_of(make(process_index=i)) for i in range(count)]
 
 
 def test_batches_do_not_depend_on_the_number_of_processes(loader):

@@ -4,13 +4,9 @@ import numpy as np
 import pytest
 
 from radejax.core.errors import DataError, UserError
+from radejax.data.kradar import points as kradar_points
 from radejax.data.kradar import reduced
-from radejax.data.kradar.points import (
-    POINT_FIELDS,
-    read_lidar,
-    read_points,
-    write_points,
-)
+from radejax.data.kradar.points import POINT_FIELDS, read_lidar, read_points
 from radejax.data.kradar.reduced import reduce_tensor, strongest_points
 from radejax.data.kradar.write import write_tesseract
 from radejax.data.points import cfar_points, local_mean_db, percentile_points
@@ -197,7 +193,7 @@ def test_points_are_written_in_three_formats(tmp_path, count):
     rng = np.random.default_rng(0)
     points = rng.normal(size=(count, len(POINT_FIELDS)))
     for suffix in ("npy", "pcd", "bin"):
-        write_points(tmp_path / f"points.{suffix}", points)
+        kradar_points.write_points(tmp_path / f"points.{suffix}", points)
     np.testing.assert_array_equal(np.load(tmp_path / "points.npy"), points)
     stored = np.fromfile(tmp_path / "points.bin", "<f4").reshape(-1, 11)
     np.testing.assert_array_equal(stored, points.astype(np.float32))

@@ -127,9 +127,8 @@ def test_folders_are_named_after_options_that_change_numbers():
     changes |= {"roi": None, "classes": ("Sedan", "Bus or Truck"), "sequences": (5,)}
     expected = "_roi_None_classes_Sedan_Bus-or-Truck_sequences_5"
     assert results.name_of_changes(changes, usual) == expected
-    assert (
-        results.name_of_changes({"split": "/a/b c.txt"}, usual) == "_split_-a-b-c.txt"
-    )
+    found = results.name_of_changes({"split": "/a/b c.txt"}, usual)
+    assert found == "_split_-a-b-c.txt"
 
 
 def test_conditions_are_in_the_papers_order():

@@ -219,6 +219,7 @@ def test_a_flipped_bit_of_the_weights_is_found(tmp_path):
 def test_folders_and_files_that_do_not_fit_are_named(tmp_path):
     config, torch_file = small.radar_config().model, tmp_path / "best.safetensors"
     _write_torch(torch_file)
+    backbone = {"image_backbone_path": "dinov3"}
     untrained, other = tmp_path / "run", tmp_path / "other"
     for folder in (untrained, other):
         folder.mkdir()
@@ -231,10 +232,7 @@ def test_folders_and_files_that_do_not_fit_are_named(tmp_path):
         (lambda: load_model(torch_file, step=3), "holds one model only, but step=3"),
         (lambda: load_model(torch_file, image_backbone="x"), "the model is RADE-Net"),
         (lambda: starting_weights(config, other), r"do not fit: .*\.heatmap_prior is"),
-        (
-            lambda: starting_weights(config, image_backbone_path="dinov3"),
-            "RadeNet has no camera",
-        ),
+        (lambda: starting_weights(config, **backbone), "RadeNet has no camera"),
     ):
         with pytest.raises((UserError, FileNotFoundError), match=message):
             call()

@@ -99,9 +99,8 @@ def test_queries_outside_the_image_are_invalid_and_clipped():
 
 
 def test_a_camera_of_zeros_sees_nothing():
-    zeros = stack_cameras(
-        [jax.tree.map(lambda x: 0 * x, small.forward_camera().camera())] * 2
-    )
+    ahead = stack_cameras([small.forward_camera().camera()] * 2)
+    zeros = jax.tree.map(lambda x: 0 * x, ahead)
     for camera in (zeros, jax.tree.map(jnp.asarray, zeros)):
         with np.errstate(invalid="ignore", divide="ignore"):
             reference = lifting.reference_points(camera, AXES, 3, 4, 2)

@@ -28,6 +28,7 @@ def _schedule(steps_per_epoch, num_epochs=1, **fields):
 
 
 CYCLIC = {"schedule": "cyclic_cosine", "final_learning_rate": 1e-5}
+_warm_up_of_cycles = _schedule(10, 6, warmup_steps=4, **CYCLIC)
 
 
 @pytest.mark.parametrize(
@@ -37,11 +38,7 @@ CYCLIC = {"schedule": "cyclic_cosine", "final_learning_rate": 1e-5}
         (_schedule(50, 2, warmup_steps=10), (0, 5, 10, 55), (0, 5e-4, 1e-3, 5.5e-4)),
         (_schedule(50, 1, max_steps=100), (0, 50, 100), (1e-3, 5.5e-4, 1e-4)),
         (_schedule(10, 6, max_steps=20, **CYCLIC), (0, 10, 20), (1e-3, 1e-5, 1e-3)),
-        (
-            _schedule(10, 6, warmup_steps=4, **CYCLIC),
-            (0, 2, 4, 14, 24),
-            (0, 5e-4, 1e-3, 1e-5, 1e-3),
-        ),
+        (_warm_up_of_cycles, (0, 2, 4, 14, 24), (0, 5e-4, 1e-3, 1e-5, 1e-3)),
     ],
 )
 def test_rates_by_step(schedule, steps, rates):
@@ -164,10 +161,7 @@ def _schedule_of(name):
     [
         (lambda: _optimizer_of("lion"), "is 'lion', expected adamw or module:function"),
         (lambda: _schedule_of("linear"), "expected cosine or cyclic_cosine or module"),
-        (
-            lambda: _schedule(50, 2, warmup_steps=100),
-            "steps is 100, expected less than",
-        ),
+        (lambda: _schedule(50, 2, warmup_steps=100), "steps is 100, expected less"),
         (
             lambda: check_patterns(PARAMS, ("neck*",)),
             r"'neck\*', .*: backbone/w, image/w$",

@@ -160,11 +160,8 @@ def test_high_pass_by_hand():
 class TestGroundClutter:
     def clutter(self, speed_mps, **changes):
         values = {"ground_clutter": 0.0004, "gain_db": 209.0, "noise_db": 109.0}
-        parameters, ego = (
-            RadarParameters(**values | changes),
-            np.array([speed_mps, 0.0]),
-        )
-        grid = RadarGrid.kradar()
+        parameters, grid = RadarParameters(**values | changes), RadarGrid.kradar()
+        ego = np.array([speed_mps, 0.0])
         noise = propagation.noise_profile("normal", grid, parameters, ego)
         return noise / 10.0**10.9 - 1.0  # above the noise
 
