@@ -145,6 +145,15 @@ def saved(kind: str = "radar", **changes: Any) -> SavedModel:
     return SavedModel(config, small_grid(), variables)
 
 
+def simulate(folder: pathlib.Path, **fields: Any) -> pathlib.Path:
+    """Simulated data in a folder, with projections instead of tensors by default."""
+    from radejax.simulation.config import SimulationOptions
+    from radejax.simulation.dataset import simulate_dataset
+
+    options = SimulationOptions().replace(**{"output": "projection", **fields})
+    return simulate_dataset(options, folder, progress=False)
+
+
 def projections(count: int) -> np.ndarray:
     rng = np.random.default_rng(0)
     shape = (count, *small_grid().projection_shape)

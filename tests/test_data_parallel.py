@@ -58,11 +58,8 @@ def _compiled(kind, num_devices, parameters="replicated"):
     mesh = devices.make_mesh(num_devices)
     whole = devices.replicated(mesh)
     placement = devices.state_sharding(state, mesh, parameters, min_size=64)
-    arguments = (
-        jax.device_put(state, placement),
-        devices.put_batch(batch, mesh),
-        jax.device_put(KEY, whole),
-    )
+    placed, key = jax.device_put(state, placement), jax.device_put(KEY, whole)
+    arguments = placed, devices.put_batch(batch, mesh), key
     sharded = jax.jit(step, out_shardings=(placement, whole))
     return sharded.lower(*arguments).compile(), arguments
 

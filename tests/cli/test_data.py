@@ -17,7 +17,6 @@ from radejax.data.records import Records
 from radejax.inference.export import export
 from radejax.inference.saved import SavedModel, save_model
 from radejax.simulation.config import SimulationOptions
-from radejax.simulation.dataset import simulate_dataset
 
 from .. import small_models as small
 from ..commands import run
@@ -29,11 +28,9 @@ RELEASES = ("polar3d", "rpc")
 def tensors(tmp_path_factory):
     """A simulated root with radar tensors."""
     grid = {"num_doppler": 4, "num_range": 24, "num_elevation": 3, "num_azimuth": 16}
-    simulation = SimulationOptions(
-        train_sequences=2, test_sequences=1, frames_per_sequence=4
-    ).replace(grid=grid)
+    sizes = {"train_sequences": 2, "test_sequences": 1, "frames_per_sequence": 4}
     root = tmp_path_factory.mktemp("simulated") / "root"
-    return simulate_dataset(simulation, root, progress=False)
+    return small.simulate(root, **sizes, grid=grid, output="tesseract")
 
 
 @pytest.fixture(scope="module", params=RELEASES)

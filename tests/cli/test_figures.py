@@ -14,10 +14,9 @@ from radejax.config import Config
 from radejax.core.structures import Boxes
 from radejax.data.kradar import KRadar
 from radejax.detection.decode import DecodeOptions
-from radejax.simulation.config import SimulationOptions
-from radejax.simulation.dataset import simulate_dataset
 from radejax.visualize import style
 
+from .. import small_models as small
 from ..commands import run
 
 
@@ -26,7 +25,7 @@ def root(tmp_path_factory):
     """One simulated sequence of one frame."""
     sizes = {"train_sequences": 1, "test_sequences": 0, "frames_per_sequence": 1}
     folder = tmp_path_factory.mktemp("overlay") / "data"
-    return simulate_dataset(SimulationOptions(**sizes), folder, progress=False)
+    return small.simulate(folder, **sizes, output="tesseract")
 
 
 @pytest.fixture

@@ -202,7 +202,7 @@ def test_wrong_radars_are_named(change, message):
     ("num_tx", "dtype", "message"),
     [
         (2, complex, r"samples is \(16, 2, 4, 64\), expected \(16, 3, 4, 64\):"),
-        (3, np.int16, "type of samples is 'int16', expected complex, as radar.is_comp"),
+        (3, np.int16, "type of samples is 'int16', expected complex"),
     ],
 )
 def test_samples_of_other_radars_are_named(num_tx, dtype, message):

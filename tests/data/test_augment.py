@@ -59,9 +59,8 @@ def test_mirrored_boxes_and_maps_stay_in_register(boxes, seed):
         (r, a), (r2, a2) = GRID.nearest_bin(*old[:2]), GRID.nearest_bin(*new[:2])
         assert r == r2
         assert abs((GRID.num_azimuth - 1 - a) - a2) <= 1  # halves round to even
-        np.testing.assert_array_equal(
-            after.projection[r, GRID.num_azimuth - 1 - a], before.projection[r, a]
-        )
+        found = after.projection[r, GRID.num_azimuth - 1 - a]
+        np.testing.assert_array_equal(found, before.projection[r, a])
         # Heading (cos, sin) mirrors with the position.
         np.testing.assert_array_equal(new[[7, 6]], old[[7, 6]] * (1, -1))
         np.testing.assert_array_equal(new[[0, 2, 3, 4, 5]], old[[0, 2, 3, 4, 5]])
@@ -101,9 +100,8 @@ def test_a_point_has_its_color_in_the_resized_and_the_mirrored_image(tmp_path):
     """Read as the model samples: pixel i has its center at i + 1/2."""
     ramp = np.full((64, 128, 3), 2 * np.arange(128)[:, None], np.uint8)
     Image.fromarray(ramp).save(tmp_path / "a.png")
-    calibration = dataclasses.replace(
-        CAMERA, intrinsics=(60.0, 60.0, 55.0, 30.0), width=128, height=64
-    )
+    fields = {"intrinsics": (60.0, 60.0, 55.0, 30.0), "width": 128, "height": 64}
+    calibration = dataclasses.replace(CAMERA, **fields)
     points = np.array([[20.0, 3.0, 0.0], [30.0, -8.5, 0.0], [15.0, 2.25, 1.0]])
     colors = []
     for scale in (1, 2):

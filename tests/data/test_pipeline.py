@@ -15,6 +15,7 @@ from radejax.data.augment import Augmentation
 from radejax.data.cameras import CameraOptions, camera_inputs
 from radejax.data.kradar import KRadar
 from radejax.data.pipeline import LoaderOptions, make_loader, make_table
+from radejax.data.projection import stack_frames
 from radejax.data.records import Records, open_projections, preprocess
 
 from .. import small_models as small
@@ -148,10 +149,8 @@ def test_preceding_frames_by_hand():
     keys += ["10/00002_00001", "1/00003b"]
     a, b, d, other, ten, c = keys
     pairs = pipeline.frame_histories(reversed(keys), 2)
-    assert pairs == {
-        **{a: (a, a), b: (a, b), c: (b, c), d: (c, d)},
-        **{other: (other, other), ten: (ten, ten)},
-    }
+    of_one = {other: (other, other), ten: (ten, ten)}
+    assert pairs == of_one | {a: (a, a), b: (a, b), c: (b, c), d: (c, d)}
     # A history ends where a frame is missing.
     three = pipeline.frame_histories([a, b, d, "1/00005_00008"], 3)
     assert three[b] == (a, a, b)
@@ -193,9 +192,7 @@ def test_samples_are_the_records_of_a_frame_and_the_preceding_ones(
                 before = frame
             repeated += before is frame or position == 0
             pair = [records[before.key], records[frame.key]]
-            channels = np.concatenate(
-                [x[..., :doppler] for x in pair] + [x[..., doppler:] for x in pair], -1
-            )
+            channels = stack_frames(pair, doppler)
             wanted = channels[:, ::-1] if probability else channels
             np.testing.assert_array_equal(sample, wanted)
     assert seen == len(test) < len(every)
@@ -242,9 +239,8 @@ def test_augmentation_changes_per_epoch_and_stays_in_register(loader, data, reco
             mirrored[int(index)].add(is_mirrored)
             count = len(data[index].boxes)
             sign = -1 if is_mirrored else 1
-            np.testing.assert_allclose(
-                batch.boxes[row, :count, 1], sign * data[index].boxes[:, 1], rtol=1e-6
-            )
+            y_m, expected = batch.boxes[row, :count, 1], sign * data[index].boxes[:, 1]
+            np.testing.assert_allclose(y_m, expected, rtol=1e-6)
     assert sum(len(seen) == 2 for seen in mirrored.values()) >= 9
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from radejax.evaluation import EvaluationSet, matching
+from radejax.evaluation.boxes import take
 
 from .scenes import kradar_scene, random_scene
 
@@ -66,17 +67,13 @@ def test_radenets_own_code_on_a_scene(golden):
     empty = np.setdiff1d(np.arange(80), truth["frame"])[:3]
     selections = np.arange(80), np.arange(9), empty
     for chosen, of_selection in zip(selections, data["ap"], strict=True):
-        part = [
-            {k: v[np.isin(table["frame"], chosen)] for k, v in table.items()}
-            for table in (truth, found)
-        ]
+        part = [take(x, np.isin(x["frame"], chosen)) for x in (truth, found)]
         for r, roi in enumerate(("narrow", "wide")):
             shared_set = EvaluationSet(*part, classes=names.tolist(), roi=roi)
             for s, empty_frames in enumerate(("class", "none")):
                 for m, protocol in enumerate(METHODS):
-                    results = shared_set.results(
-                        protocol, iou_thresholds=(0.3, 0.5), empty_frames=empty_frames
-                    )
+                    terms = {"iou_thresholds": (0.3, 0.5), "empty_frames": empty_frames}
+                    results = shared_set.results(protocol, **terms)
                     expected = 100 * of_selection[:, :, r, s, m].ravel()
                     is_defined = [x.is_defined for x in results]
                     found_aps = np.where(is_defined, aps(results), np.nan)
@@ -93,9 +90,8 @@ def test_a_slow_implementation_on_three_scenes(golden, monkeypatch, chunk):
     data = np.load(golden / "evaluation_scenes.npz")
     ious, cuts = data["ious"].tolist(), data["cuts"].tolist()
     for scene, expected in enumerate(data["ap"]):
-        truth, found, frames = random_scene(
-            101 + scene, num_frames=40, num_objects=120, num_classes=3, ties=scene != 1
-        )
+        sizes = {"num_frames": 40, "num_objects": 120, "num_classes": 3}
+        truth, found, frames = random_scene(101 + scene, ties=scene != 1, **sizes)
         classes = data["classes"].tolist()
         shared_set = EvaluationSet(truth, found, classes=classes, frames=frames)
         for p, protocol in enumerate(data["protocols"].tolist()):
@@ -112,11 +108,10 @@ def test_k_radars_own_code_on_real_labels(shared):
     truth = np.load(folder / "ground_truth.npz")
     found = np.load(folder / "predictions.npz")
     names, weather = truth["class_names"], truth["frame_weather"]
-    columns = [
-        {k: table[k] for k in ("frame", "box", "score") if k in table}
-        | {"cls": names[table["cls"]]}
-        for table in (truth, found)
-    ]
+    columns = []
+    for table in (truth, found):
+        column = {k: table[k] for k in ("frame", "box", "score") if k in table}
+        columns.append(column | {"cls": names[table["cls"]]})
     data = EvaluationSet(*columns, frames={"frame": np.arange(weather.size)})
     keys = {name: key for key, name in expected["classes"].items()}
     checked = 0

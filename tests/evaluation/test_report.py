@@ -17,14 +17,8 @@ from radejax.evaluation.results import ReportOptions
 from .scenes import random_scene
 
 OPTIONS = ReportOptions(roi=None, plots=False, protocols=("all_point",))
-STORED = ReportOptions(
-    roi=None,
-    plots=False,
-    bootstrap=20,
-    iou_thresholds=(0.3, 0.5),
-    protocols=("coco101", "kradar_r40"),
-    label_version="v2.1",
-)
+STORED = OPTIONS.replace(iou_thresholds=(0.3, 0.5), protocols=("coco101", "kradar_r40"))
+STORED = STORED.replace(bootstrap=20, label_version="v2.1")
 
 
 @pytest.fixture(scope="module")
@@ -167,7 +161,7 @@ def test_score_thresholds_are_not_chosen_on_a_test_split(scene, tmp_path):
     data = EvaluationSet(truth, found, frames=frames)
     for cls, row in chosen.items():
         there, here = (
-            next(x for x in part.results("all_point", spaces="3d") if x.cls == cls)
+            {x.cls: x for x in part.results("all_point", spaces="3d")}[cls]
             for part in (other, data)
         )
         threshold = scores.choose_thresholds(there, 0.9)["best_f1"]

@@ -29,8 +29,6 @@ from radejax.inference.detect_files import (
 )
 from radejax.inference.detector import Detector
 from radejax.models.options import DinoRadeOptions, ImageOptions
-from radejax.simulation.config import SimulationOptions
-from radejax.simulation.dataset import simulate_dataset
 
 from .. import small_models as small
 
@@ -351,8 +349,7 @@ def test_two_frames_of_one_name_are_rejected(tmp_path):
 def test_images_of_simulated_folders_are_found(tmp_path):
     """Their labels are in `info_label_v2_1`."""
     sizes = {"train_sequences": 1, "test_sequences": 0, "frames_per_sequence": 1}
-    options = SimulationOptions(output="projection", **sizes)
-    root = simulate_dataset(options, tmp_path / "data", progress=False)
+    root = small.simulate(tmp_path / "data", **sizes)
     (path,) = find_frames([root])
     detector = SimpleNamespace(
         model=models.build(DinoRadeOptions(image=ImageOptions(size=(180, 320)))),

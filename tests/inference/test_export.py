@@ -415,15 +415,12 @@ def test_onnx_files_give_the_same_boxes(kind, tmp_path, monkeypatch):
         found = run("detector.onnx", inputs | feed)
         expected = detector(*arguments, **settings)
         _check({f"{name}_": x for name, x in found.items()}, "", expected)
-    maps = jax.jit(lambda v, *x: detector.model.apply(v, *x, train=False))(
-        detector.variables, *arguments
-    )
+    maps = jax.jit(detector.model.apply)(detector.variables, *arguments)
     rows = json.loads((tmp_path / "inputs.json").read_text())
     options = runtime.SessionOptions()
     options.intra_op_num_threads = 1
-    found = exported_loader.load(tmp_path, session_options=options)(
-        *inputs_of_loader, score_threshold=0.1
-    )
+    detect = exported_loader.load(tmp_path, session_options=options)
+    found = detect(*inputs_of_loader, score_threshold=0.1)
     _check({f"{name}_": x for name, x in found.items()}, "", detector(*arguments))
     session = runtime.InferenceSession(tmp_path / "detector.onnx")
     told = session.get_modelmeta().custom_metadata_map

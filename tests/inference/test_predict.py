@@ -17,8 +17,6 @@ from radejax.inference.saved import SavedModel
 from radejax.losses.detection import detection_loss
 from radejax.runs.data import Data
 from radejax.runs.evaluate import Evaluation
-from radejax.simulation.config import SimulationOptions
-from radejax.simulation.dataset import simulate_dataset
 
 from .. import small_models as small
 
@@ -29,8 +27,7 @@ def setup(tmp_path_factory):
     folder = tmp_path_factory.mktemp("predict")
     grid = {"num_doppler": 2, "num_range": 32, "num_elevation": 3, "num_azimuth": 28}
     counts = {"train_sequences": 0, "test_sequences": 1, "frames_per_sequence": 5}
-    simulation = SimulationOptions(**counts).replace(grid=grid)
-    root = simulate_dataset(simulation, folder / "data", progress=False)
+    root = small.simulate(folder / "data", **counts, grid=grid, output="tesseract")
     config = small.radar_config().replace(
         data={"roots": (str(root),), "records": str(folder / "records")},
         evaluation={"score_threshold": 0.45, "batch_size": 3},
@@ -41,14 +38,9 @@ def setup(tmp_path_factory):
     preprocess(data.frames, folder / "records", num_workers=0, progress=False)
     records = data.records
     variables = small.drawn(model, np.zeros((1, *records.grid.projection_shape)))
-    return SimpleNamespace(
-        config=config,
-        model=model,
-        data=data,
-        frames=data.split("test"),
-        records=records,
-        variables=variables,
-    )
+    made = SimpleNamespace(config=config, model=model, variables=variables)
+    made.data, made.records, made.frames = data, records, data.split("test")
+    return made
 
 
 def _predict(setup, num_devices):

@@ -30,9 +30,8 @@ def inputs(seed=0, batch_geometry=True):
     is_valid[:, 1, 1] = False  # a bin that sees nothing
     is_valid[:, 0, 0] = True
     normal = lambda *s: rng.standard_normal(s).astype(np.float32)  # noqa: E731
-    reference = ReferencePoints(
-        points=rng.random((n, R, A, E, 2)).astype(np.float32), is_valid=is_valid
-    )
+    points = rng.random((n, R, A, E, 2)).astype(np.float32)
+    reference = ReferencePoints(points, is_valid)
     maps = normal(B, R, A, C), rng.random((B, R, A, D)), normal(B, H, W, C)
     return (*map(jnp.asarray, maps), reference)
 

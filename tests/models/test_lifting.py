@@ -76,9 +76,9 @@ def test_released_reference_points(golden, released):
     assert whole.is_valid.mean() == pytest.approx(0.953, abs=5e-4)
     # In the program, in float32, for two cameras.
     cameras = stack_cameras([camera] * 2)
-    in_program = jax.jit(
-        lambda c: lifting.reference_points(c, axes, 256, 112, 10, "official")
-    )(jax.tree.map(jnp.asarray, cameras))
+    project = jax.jit(lifting.reference_points, static_argnums=range(1, 6))
+    cameras = jax.tree.map(jnp.asarray, cameras)
+    in_program = project(cameras, axes, 256, 112, 10, "official")
     second = jax.tree.map(lambda x: x[1], in_program)
     check_official(second, file["index"], file["reference_points_f64"], file["valid"])
 

@@ -14,17 +14,15 @@ from radejax.data.kradar import KRadar
 from radejax.runs import data as run_data
 from radejax.runs.data import data_of_run, located, open_data
 from radejax.simulation.config import SimulationOptions
-from radejax.simulation.dataset import simulate_dataset
 
-SMALL = SimulationOptions(train_sequences=2, test_sequences=1)
+from .. import small_models as small
 
 
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory):
     """Sequences 1 and 2 of the train split, 3 of the test split, of two frames."""
-    simulation = SMALL.replace(output="projection", frames_per_sequence=2)
-    root = tmp_path_factory.mktemp("simulated") / "sim"
-    return simulate_dataset(simulation, root, progress=False)
+    sizes = {"train_sequences": 2, "test_sequences": 1, "frames_per_sequence": 2}
+    return small.simulate(tmp_path_factory.mktemp("simulated") / "sim", **sizes)
 
 
 @pytest.fixture

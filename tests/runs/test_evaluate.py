@@ -128,15 +128,15 @@ def evaluated(tmp_path, monkeypatch):
     return run
 
 
+ALL = {"split": "all", "step": "best"}
+
+
 @pytest.mark.parametrize(
     ("choosing", "options", "folder", "remark"),
     [
         ("test", {"step": "best"}, "_checkpoint_best", "chosen on the test split"),
         ("test", {}, "", ""),
-        (
-            *("validation", {"split": "all", "step": "best"}, "_all_checkpoint_best"),
-            "chosen on the validation split",
-        ),
+        ("validation", ALL, "_all_checkpoint_best", "chosen on the validation split"),
         ("test", {"roi": "wide", "step": 70}, "_checkpoint_70_roi_wide", ""),
         ("test", {"out": "elsewhere", "roi": "wide"}, None, ""),
     ],

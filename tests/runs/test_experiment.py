@@ -15,8 +15,6 @@ from radejax.inference.detect_files import detect_files, find_inputs
 from radejax.inference.detector import Detector
 from radejax.runs import evaluate, experiment
 from radejax.runs.experiment import claimed
-from radejax.simulation.config import SimulationOptions
-from radejax.simulation.dataset import simulate_dataset
 from radejax.training.checkpoints import Checkpoints
 
 from .. import small_models as small
@@ -33,8 +31,7 @@ def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
         return SimpleNamespace(step=1), True
 
     sizes = {"train_sequences": 1, "test_sequences": 0, "frames_per_sequence": 2}
-    simulation = SimulationOptions(output="projection", **sizes)
-    root = simulate_dataset(simulation, tmp_path / "data", progress=False)
+    root = small.simulate(tmp_path / "data", **sizes)
     config = Config().replace(
         model={"doppler_bins": 16, "elevation_bins": 9},
         train={"batch_size": 2},

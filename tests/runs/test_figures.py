@@ -18,8 +18,6 @@ from radejax.evaluation.results import ReportOptions
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.runs import figures
 from radejax.runs.figures import draw_training_samples
-from radejax.simulation.config import SimulationOptions
-from radejax.simulation.dataset import simulate_dataset
 
 from .. import small_models as small
 from ..commands import run
@@ -62,9 +60,7 @@ def test_bins_out_of_view_and_frames_without_image_do_not_count():
 def root(tmp_path_factory):
     """Two simulated sequences of one frame."""
     sizes = {"train_sequences": 0, "test_sequences": 2, "frames_per_sequence": 1}
-    options = SimulationOptions(output="projection", **sizes)
-    folder = tmp_path_factory.mktemp("compared") / "data"
-    return simulate_dataset(options, folder, progress=False)
+    return small.simulate(tmp_path_factory.mktemp("compared") / "data", **sizes)
 
 
 def test_scenes_show_which_boxes_match(root):

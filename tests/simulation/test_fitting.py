@@ -36,10 +36,9 @@ def recording(grid=GRID, seed=0, **changes):
     amplitude = 10.0 ** (145.0 / 20.0)
     target = points(grid.range_m[20], 0.2, 0.0, grid.doppler_mps[3], amplitude)
     noise = sensor.receiver_noise(grid, parameters).astype(np.float32)
-    rows = tensor.simulate(
-        target, noise, tensor.frame_key(seed), state, grid=grid,
-        parameters=parameters, output="tesseract",
-    )  # fmt: skip
+    given = target, noise, tensor.frame_key(seed), state
+    options = {"grid": grid, "parameters": parameters, "output": "tesseract"}
+    rows = tensor.simulate(*given, **options)
     return np.asarray(rows).transpose(tensor.TESSERACT_OF_ROWS), parameters
 
 

@@ -53,11 +53,9 @@ def test_trainings_of_the_papers(name, words, batch, epochs, floor, classes, lab
     is_cyclic = "official" in words
     period = 2 * (steps // epochs) if is_cyclic else 2 * steps
     phase = np.cos(2 * np.pi * np.arange(steps + 1) / period)
-    np.testing.assert_allclose(
-        jax.jit(schedule)(np.arange(steps + 1)),
-        floor + (1e-3 - floor) * (1 + phase) / 2,
-        rtol=1e-4,
-    )
+    rates = jax.jit(schedule)(np.arange(steps + 1))
+    expected = floor + (1e-3 - floor) * (1 + phase) / 2
+    np.testing.assert_allclose(rates, expected, rtol=1e-4)
 
 
 RELEASE = {"model.input_center", "model.input_scale", "data.release"}

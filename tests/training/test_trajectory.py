@@ -164,10 +164,8 @@ def by_torch_name(load, tensors, variables):
     marked = {n: np.full(tensors[n].shape, i, np.float32) for i, n in enumerate(names)}
     tree = load(marked)
     assert jax.tree.structure(tree) == jax.tree.structure(variables)
-    position, value = (
-        np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(t)])
-        for t in (tree, variables)
-    )
+    leaves = (map(np.ravel, jax.tree.leaves(x)) for x in (tree, variables))
+    position, value = (np.concatenate([*arrays]) for arrays in leaves)
     order = np.argsort(position, kind="stable")
     ends = np.searchsorted(position[order], np.arange(len(names) + 1))
     parts = {n: value[order[ends[i] : ends[i + 1]]] for i, n in enumerate(names)}
@@ -186,11 +184,9 @@ def images(fixture, model, variables):
     embedded, index = np.stack(features), fixture["token_index"]
     patches = embedded.reshape(len(features), -1, embedded.shape[-1])
     after = 5  # the class token and four registers
-    np.testing.assert_allclose(
-        patches[:, index[index >= after] - after],
-        fixture["tokens"][:, index >= after],
-        atol=2e-5,
-    )
+    found = patches[:, index[index >= after] - after]
+    expected = fixture["tokens"][:, index >= after]
+    np.testing.assert_allclose(found, expected, atol=2e-5)
     return embedded
 
 

@@ -20,9 +20,8 @@ QUIET = np.zeros((32, 16), np.float32)
 
 def points(range_m, azimuth=0.0, elevation=0.0, velocity=0.0, amplitude=1.0):
     """Scatterers of equal length from numbers or lists; amplitude may be complex."""
-    columns = np.broadcast_arrays(
-        *map(np.atleast_1d, (range_m, azimuth, elevation, velocity, amplitude))
-    )
+    numbers = range_m, azimuth, elevation, velocity, amplitude
+    columns = np.broadcast_arrays(*map(np.atleast_1d, numbers))
     amplitude = columns[4].astype(complex)
     return tensor.Scatterers(
         *(c.astype(np.float32) for c in columns[:4]),
