@@ -41,15 +41,8 @@ def uneven_grid(**axes: np.ndarray) -> RadarGrid:
     return RadarGrid(**(fields | axes))
 
 
-_SIZES = {
-    "doppler_bins": 2,
-    "elevation_bins": 3,
-    "widths": (8, 8),
-    "decoder_width": 8,
-    "num_groups": 4,
-    "neck": "plain",
-    "heads": "default",
-}
+_SIZES = {"doppler_bins": 2, "elevation_bins": 3, "neck": "plain", "heads": "default"}
+_SIZES |= {"widths": (8, 8), "decoder_width": 8, "num_groups": 4}
 
 
 def shrink_run(config: Config) -> Config:

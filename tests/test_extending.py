@@ -212,11 +212,9 @@ def test_commands_read_such_data_by_the_config(tmp_path, monkeypatch):
     assert both.camera is not None
     assert radar.image is None
     assert [len(scene.ground_truth or ()) for scene in scenes] == [1, 1]
-    for words, text in (
-        (("1/0002", "--lidar"), "leave it out"),
-        (("7/0001",), "no frames of these"),
-    ):
-        assert text in run("overlay", *words, *given, code=2).output
+    text = run("overlay", "1/0002", *given, "--lidar", code=2).output
+    assert "leave it out" in text
+    assert "no frames of these" in run("overlay", "7/0001", *given, code=2).output
 
 
 def test_objects_that_cannot_be_learned_are_left_out_and_counted(tmp_path):
@@ -225,11 +223,8 @@ def test_objects_that_cannot_be_learned_are_left_out_and_counted(tmp_path):
     good = [12.0, 1.0, 0.0, 4.2, 1.8, 1.6, 0.1]
     boxes = np.array([good] * 5)
     boxes[1, 2], boxes[2, 4], boxes[3, 0], boxes[4, 1] = np.nan, -1.0, -12.0, 99.0
-    content = dict(np.load(path)) | {
-        "boxes": boxes,
-        "classes": np.array(["Sedan"] * 5),
-        "velocity_mps": np.zeros((5, 2)),
-    }
+    content = dict(np.load(path)) | {"boxes": boxes, "velocity_mps": np.zeros((5, 2))}
+    content["classes"] = np.array(["Sedan"] * 5)
     np.savez(path, **content)
     config = located(_config().replace(data={"roots": (str(root),)}))
     data = Data(config)

@@ -15,7 +15,7 @@ import pytest
 from click.testing import CliRunner
 
 from radejax.config import load_config, load_module
-from radejax.core.errors import DataError, UserError
+from radejax.core.errors import UserError
 from radejax.data.cameras import require_images
 from radejax.data.records import open_embeddings
 from radejax.inference.saved import load_model
@@ -161,10 +161,10 @@ def test_training_from_embeddings_is_the_same(from_images, from_embeddings, data
     # The evaluation uses the embeddings too: the backbone's weights do not exist.
     assert "image_backbone" not in load_model(from_embeddings).variables["params"]
     reports = [
-        json.loads((run / "evaluation" / "metrics.json").read_text())["ap"]
-        for run in (from_embeddings, from_images)
+        x / "evaluation" / "metrics.json" for x in (from_embeddings, from_images)
     ]
-    assert reports[0] == reports[1]
+    one, other = (json.loads(path.read_text())["ap"] for path in reports)
+    assert one == other
 
 
 def test_example_compares_fusion_and_radar_by_the_lens(
@@ -240,17 +240,9 @@ def test_other_data_without_cameras_are_an_error(data, from_images, tmp_path):
 
 
 def test_embeddings_that_do_not_fit_are_rejected(data, embeddings, tmp_path):
-    config = small_config()
     paths = {"roots": (str(data.folder),), "records": str(data.folder / "records")}
-    paths["embeddings"] = str(embeddings)
-
-    def open_data(fields):
-        changed = config.replace(data=paths).with_fields(fields)
-        return Data(changed)
-
-    for call, message in (
-        (lambda: open_data({"data.mirror_probability": 0.5}), "cannot be mirrored"),
-        (lambda: open_embeddings(tmp_path / "nothing"), "radejax embed"),
-    ):
-        with pytest.raises((UserError, DataError, FileNotFoundError), match=message):
-            call()
+    config = small_config().replace(data=paths | {"embeddings": str(embeddings)})
+    with pytest.raises(UserError, match="cannot be mirrored"):
+        Data(config.with_fields({"data.mirror_probability": 0.5}))
+    with pytest.raises((UserError, FileNotFoundError), match="radejax embed"):
+        open_embeddings(tmp_path / "nothing")

@@ -299,11 +299,8 @@ def written(tmp_path):
 
 @pytest.mark.wrong_types
 def test_table_by_hand(written):
-    frames = [
-        frame_of("1/b", [BOX, BOX], ["Bicycle", "Sedan"]),
-        frame_of("1/a"),
-        frame_of("1/c", [BOX], ["Pedestrian"]),
-    ]
+    frames = [frame_of("1/b", [BOX, BOX], ["Bicycle", "Sedan"]), frame_of("1/a")]
+    frames.append(frame_of("1/c", [BOX], ["Pedestrian"]))
     table = make_table(written, frames, max_objects=2, classes=("Sedan", "Bicycle"))
     assert table.keys == (("1/b",), ("1/a",), ("1/c",))
     assert table.classes.tolist() == [[1, 0], [-1, -1], [-1, -1]]

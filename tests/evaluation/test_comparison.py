@@ -5,17 +5,12 @@ import pytest
 import scipy.stats
 
 from radejax.core.errors import UserError
-from radejax.evaluation import comparison, kitti
+from radejax.evaluation import comparison, kitti, results
 from radejax.evaluation.comparison import compare, compare_files, difference
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files import Source, evaluate_files, stored_options
 from radejax.evaluation.report import write_report
-from radejax.evaluation.results import (
-    ReportOptions,
-    interval,
-    resample,
-    sequence_weights,
-)
+from radejax.evaluation.results import ReportOptions
 
 from ..commands import run
 from .scenes import random_scene
@@ -82,9 +77,11 @@ def test_the_comparison_is_paired():
     row = compare({"": one}, {"": other}, FRAMES, options, spaces=["bev"])[0]
     samples = []
     for seed, data in enumerate((other, one)):
-        weights = sequence_weights(FRAMES["sequence"], resamples=300, seed=seed)
-        samples.append(resample(data, weights, "all_point", "bev", 0.3)[:, 0])
-    low, high = interval(samples[0] - samples[1])
+        terms = {"resamples": 300, "seed": seed}
+        weights = results.sequence_weights(FRAMES["sequence"], **terms)
+        ap = results.resample(data, weights, "all_point", "bev", 0.3)
+        samples.append(ap[:, 0])
+    low, high = results.interval(samples[0] - samples[1])
     assert row.high - row.low < 0.7 * (high - low)
 
 

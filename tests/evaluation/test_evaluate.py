@@ -174,9 +174,8 @@ def test_region_and_classes_filter_both_sides_and_are_in_the_name(roi):
         for side in ("ground truth", "predictions")
         for reason in ("class not evaluated", "center outside the region of interest")
     }
-    assert data.results("kradar_r40", score_threshold=0.3)[-1].metric == (
-        "ap_3d_iou30/kradar_r40/score>0.3/skip=frame/labels=v2.1/roi=narrow"
-    )
+    name = "ap_3d_iou30/kradar_r40/score>0.3/skip=frame/labels=v2.1/roi=narrow"
+    assert data.results("kradar_r40", score_threshold=0.3)[-1].metric == name
 
 
 # Laws -----------------------------------------------------------------------------------

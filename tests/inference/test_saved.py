@@ -40,13 +40,9 @@ def _equal(a, b):
 
 
 def _write_torch(path):
-    options = small.radar_config().model.replace(
-        doppler_bins=64,
-        elevation_bins=37,
-        num_groups=32,
-        widths=(32, 32),
-        decoder_width=64,
-    )
+    bins = {"doppler_bins": 64, "elevation_bins": 37}
+    sizes = {"num_groups": 32, "widths": (32, 32), "decoder_width": 64}
+    options = small.radar_config().model.replace(**bins, **sizes)
     model = models.build(options)
     inputs = np.zeros((1, 16, 16, 101), np.float32)
     shapes = jax.eval_shape(model.init, jax.random.key(0), inputs)

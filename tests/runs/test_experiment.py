@@ -32,11 +32,9 @@ def test_without_test_frames_a_run_trains_and_says_that_it_is_not_evaluated(
 
     sizes = {"train_sequences": 1, "test_sequences": 0, "frames_per_sequence": 2}
     root = small.simulate(tmp_path / "data", **sizes)
-    config = Config().replace(
-        model={"doppler_bins": 16, "elevation_bins": 9},
-        train={"batch_size": 2},
-        data={"roots": (str(root),)},
-    )
+    bins = {"doppler_bins": 16, "elevation_bins": 9}
+    config = Config().replace(model=bins, train={"batch_size": 2})
+    config = config.replace(data={"roots": (str(root),)})
     monkeypatch.setattr(experiment, "fit", fit)
     experiment.run(config, tmp_path / "run", mesh=one_device)
     assert f"no frames of the test split in {root}" in said_before[0]

@@ -22,11 +22,8 @@ def detector(tmp_path_factory):
     """Detector with random weights on a dataset of four frames to train on and three others."""
     config = small.shrink_run(load_config("quickstart:short"))
     sizes = {"train_sequences": 2, "test_sequences": 3, "frames_per_sequence": 1}
-    config = config.replace(
-        simulation=sizes,
-        data={"roots": (str(tmp_path_factory.mktemp("data") / "simulated"),)},
-    )
-    config = located(config)
+    root = tmp_path_factory.mktemp("data") / "simulated"
+    config = located(config.replace(simulation=sizes, data={"roots": (str(root),)}))
     simulate_missing(config)
     grid = config.simulation.make_grid()
     inputs = np.zeros((1, *grid.projection_shape), np.float32)

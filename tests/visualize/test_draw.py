@@ -54,12 +54,9 @@ def test_box_is_drawn_on_its_echo(range_idx, azimuth_idx):
 
 
 def test_a_scan_of_360_degrees_is_drawn_whole():
-    grid = dataclasses.replace(
-        GRID,
-        azimuth_rad=np.linspace(-np.pi, np.pi, 36, endpoint=False),
-        fov_azimuth_rad=np.pi,
-        fov_range_m=118.0,
-    )
+    azimuth_rad = np.linspace(-np.pi, np.pi, 36, endpoint=False)
+    fov = {"fov_azimuth_rad": np.pi, "fov_range_m": 118.0}
+    grid = dataclasses.replace(GRID, azimuth_rad=azimuth_rad, **fov)
     truth = Boxes.one_frame([-15.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0], ["Sedan"])
     projection = np.zeros(grid.projection_shape, np.float32)
     drawn = Scene(projection, grid, ground_truth=truth)
@@ -194,12 +191,8 @@ def test_map_shows_every_bin_of_a_partial_extent():
 
 SMALL = RadarGrid.reduced(num_doppler=4, num_range=6, num_elevation=3, num_azimuth=5)
 # The digits of a value are its place: range, azimuth, channel.
-PROJECTION = (
-    0.1 * np.arange(6)[:, None, None]
-    + 0.01 * np.arange(5)[None, :, None]
-    + 0.001 * np.arange(7)
-).astype(np.float32)
-SLICED = Scene(PROJECTION, SMALL)
+PROJECTION = np.einsum("irac,i->rac", np.indices((6, 5, 7)), [0.1, 0.01, 0.001])
+SLICED = Scene(PROJECTION.astype(np.float32), SMALL)
 
 
 def planes(figure):

@@ -16,10 +16,8 @@ STAGE = {"block": np.arange(2.0)}
 
 @pytest.fixture
 def resnet(monkeypatch):
-    part = {
-        "params": {"image_backbone": TRUNK, "image_neck": STAGE},
-        "batch_stats": {"image_neck": STAGE},
-    }
+    part = {"params": {"image_backbone": TRUNK, "image_neck": STAGE}}
+    part["batch_stats"] = {"image_neck": STAGE}
     monkeypatch.setattr(image_backbone, "load_resnet", lambda path, model: part)
     return build(load_config("dinorade:rcw_resnet50").model)
 

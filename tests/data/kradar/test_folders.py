@@ -5,13 +5,7 @@ import zipfile
 import pytest
 
 from radejax.core.errors import DataError, UserError
-from radejax.data.kradar import KRadar, folders, write
-from radejax.data.kradar.conditions import (
-    KRADAR_CONDITIONS,
-    WEATHERS,
-    Conditions,
-    read_description,
-)
+from radejax.data.kradar import KRadar, conditions, folders, write
 from radejax.data.kradar.folders import read_calibration, read_split
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -224,10 +218,10 @@ def test_conditions_of_the_published_sequences(shared):
     with open(shared / "data/kradar/sequences.csv") as file:
         rows = {int(row["seq"]): row for row in csv.DictReader(file)}
     for number, row in rows.items():
-        conditions = Conditions(row["environment"], row["time"], row["weather"])
-        assert KRADAR_CONDITIONS[number] == conditions
-    assert rows.keys() == KRADAR_CONDITIONS.keys()
-    assert {row["weather"] for row in rows.values()} == set(WEATHERS)
+        published = row["environment"], row["time"], row["weather"]
+        assert conditions.KRADAR_CONDITIONS[number] == conditions.Conditions(*published)
+    assert rows.keys() == conditions.KRADAR_CONDITIONS.keys()
+    assert {row["weather"] for row in rows.values()} == set(conditions.WEATHERS)
 
 
 @pytest.mark.parametrize(
@@ -235,7 +229,7 @@ def test_conditions_of_the_published_sequences(shared):
     [
         (read_calibration, "frame difference,x,y\n", ":2: '', expected three"),
         (read_calibration, "h\n1,2", ":2: '1,2', expected three numbers"),
-        (read_description, "", ":1: '', expected 'environment"),
+        (conditions.read_description, "", ":1: '', expected 'environment"),
         (read_split, "1,00033_00001.txt\n1;x", ":2: '1;x', expected"),
     ],
 )
@@ -252,7 +246,7 @@ def test_readers_accept_what_is_on_the_disks(tmp_path):
     path.write_bytes(b"frame difference,x,y\r\n 32, -2.54, 0.3\r\n")
     assert read_calibration(path) == (32, -2.54, 0.3)
     path.write_text("Urban, Day ,Normal")
-    assert read_description(path).environment == "urban"
+    assert conditions.read_description(path).environment == "urban"
     path.write_text("1,00033_00001.txt\n2,00034_00002.txt")
     assert read_split(path) == [(1, "00033_00001"), (2, "00034_00002")]
 
