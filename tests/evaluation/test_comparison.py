@@ -274,7 +274,7 @@ def test_incomparable_runs_are_reported(scene, tmp_path):
     moved = make({**TRUTH, "box": TRUTH["box"] + 0.1})
     three = make(classes=(*CLASSES, "Bicycle"))
     for call, message in (
-        (lambda: compare_files([tmp_path] * 2, None, Source(), once), "no column seq"),
+        (lambda: compare_files([tmp_path] * 2, None, Source(), OPTIONS), "no column"),
         (lambda: compare({"": data}, {"": moved}, FRAMES, once), "different objects"),
         (lambda: compare({"": data}, {"": three}, FRAMES, once), "different classes"),
     ):
