@@ -313,7 +313,7 @@ def test_classes_that_do_not_exist_are_wrong_use(
 @pytest.mark.parametrize(
     ("name", "code", "reason"),
     [
-        ("metrics.json", 1, "metrics.json"),
+        ("metrics.json", 2, "metrics.json"),
         ("ground_truth.npz", 2, "ground_truth.npz"),
         ("frames.json", 1, "expected one of the frames that are eval"),
     ],
