@@ -234,10 +234,8 @@ def released() -> Callable[[str], dict[str, np.ndarray]]:
     arrays = dict(np.load(GOLDEN / "released.npz"))
 
     def group(name: str) -> dict[str, np.ndarray]:
-        prefix = f"{name}/"
-        found = {
-            k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)
-        }
+        keys = [key for key in arrays if key.startswith(f"{name}/")]
+        found = {key.removeprefix(f"{name}/"): arrays[key] for key in keys}
         assert found, name
         return found
 

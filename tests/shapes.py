@@ -53,9 +53,8 @@ def check(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(function)
     def init(self: Any, *args: Any, **kwargs: Any) -> Any:
-        is_free = isinstance(self, struct.PyTreeNode | nn.Module) or hasattr(
-            self, "__post_init__"
-        )
+        is_pytree = isinstance(self, struct.PyTreeNode | nn.Module)
+        is_free = is_pytree or hasattr(self, "__post_init__")
         return (function if is_free else checked)(self, *args, **kwargs)
 
     return init
@@ -63,6 +62,5 @@ def check(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def install() -> Any:
     """Check the modules that are imported from now on; a context manager ends it."""
-    return install_import_hook(
-        [f"radejax.{name}" for name in PACKAGES], f"{__name__}.check"
-    )
+    modules = [f"radejax.{name}" for name in PACKAGES]
+    return install_import_hook(modules, f"{__name__}.check")

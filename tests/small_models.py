@@ -41,15 +41,8 @@ def uneven_grid(**axes: np.ndarray) -> RadarGrid:
     return RadarGrid(**(fields | axes))
 
 
-_SIZES = {
-    "doppler_bins": 2,
-    "elevation_bins": 3,
-    "widths": (8, 8),
-    "decoder_width": 8,
-    "num_groups": 4,
-    "neck": "plain",
-    "heads": "default",
-}
+_SIZES = {"doppler_bins": 2, "elevation_bins": 3, "neck": "plain", "heads": "default"}
+_SIZES |= {"widths": (8, 8), "decoder_width": 8, "num_groups": 4}
 
 
 def shrink_run(config: Config) -> Config:
@@ -139,11 +132,19 @@ def detector_with_output(*, num_frames: int = 1, **options: Any) -> Detector:
 def saved(kind: str = "radar", **changes: Any) -> SavedModel:
     """An untrained model; `changes` are fields of its config, dots as "__"."""
     config = {"radar": radar_config, "camera": camera_config}[kind]()
-    config = config.with_fields(
-        {name.replace("__", "."): value for name, value in changes.items()}
-    )
+    fields = {name.replace("__", "."): value for name, value in changes.items()}
+    config = config.with_fields(fields)
     variables = _variables(kind, config.data.num_frames)
     return SavedModel(config, small_grid(), variables)
+
+
+def simulate(folder: pathlib.Path, **fields: Any) -> pathlib.Path:
+    """Simulated data in a folder, with projections instead of tensors by default."""
+    from radejax.simulation.config import SimulationOptions
+    from radejax.simulation.dataset import simulate_dataset
+
+    options = SimulationOptions().replace(**{"output": "projection", **fields})
+    return simulate_dataset(options, folder, progress=False)
 
 
 def projections(count: int) -> np.ndarray:
@@ -188,6 +189,13 @@ def official_calibration() -> CameraCalibration:
         translation_m=extrinsics[:, 3],
         radar_from_lidar_m=OFFICIAL_OFFSET_M,
     )
+
+
+def forward_camera(**fields: Any) -> CameraCalibration:
+    """100 x 80 pixels, focal length 50, looking along x from the radar."""
+    settings = {"intrinsics": (50.0, 50.0, 50.0, 40.0), "width": 100, "height": 80}
+    settings["radar_from_lidar_m"] = (0.0, 0.0, 0.0)
+    return calibration(**(settings | fields))
 
 
 def calibration(**fields: Any) -> CameraCalibration:

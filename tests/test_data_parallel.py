@@ -7,8 +7,6 @@ frames only, and to send no part of a frame to another.
 import functools
 import math
 import re
-from collections.abc import Callable
-from typing import Any
 
 import chex
 import jax
@@ -18,7 +16,6 @@ import pytest
 from radejax import models
 from radejax.config import Config
 from radejax.core import devices
-from radejax.core.structures import Batch
 from radejax.inference.inputs import Settings
 from radejax.training.step import create_state, make_train_step
 
@@ -36,7 +33,7 @@ KEY = jax.random.key(7)
 
 
 @functools.cache
-def _case(kind: str) -> tuple[Any, Batch, Any, Callable[..., Any]]:
+def _case(kind):
     """Model, batch, state and step of one kind of model of small width."""
     has_camera = kind != "radenet"
     config = small_models.camera_config() if has_camera else small_models.radar_config()
@@ -47,38 +44,28 @@ def _case(kind: str) -> tuple[Any, Batch, Any, Callable[..., Any]]:
     variables = small_models.drawn(model, *inputs)
     # Gradient descent, because the optimizer's work on each device is that of one device.
     optimizer = optax.sgd(1e-3)
-    state = create_state(
-        variables,
-        optimizer,
-        use_ema=False,
-        model=model,
-    )
+    state = create_state(variables, optimizer, use_ema=False, model=model)
     grid = models.map_grid(small_models.small_grid(), model, "true")
     step = make_train_step(model, optimizer, grid, loss=config.loss)
     return model, batch, state, step
 
 
 @functools.cache
-def _compiled(
-    kind: str, num_devices: int, parameters: str = "replicated"
-) -> tuple[Any, Any]:
+def _compiled(kind, num_devices, parameters="replicated"):
     """A step that is compiled for some devices, and its arguments on them."""
     _, batch, state, step = _case(kind)
     mesh = devices.make_mesh(num_devices)
     whole = devices.replicated(mesh)
     placement = devices.state_sharding(state, mesh, parameters, min_size=64)
-    arguments = (
-        jax.device_put(state, placement),
-        devices.put_batch(batch, mesh),
-        jax.device_put(KEY, whole),
-    )
+    placed, key = jax.device_put(state, placement), jax.device_put(KEY, whole)
+    arguments = placed, devices.put_batch(batch, mesh), key
     sharded = jax.jit(step, out_shardings=(placement, whole))
     return sharded.lower(*arguments).compile(), arguments
 
 
-def _moved(program: Any) -> dict[str, list[int]]:
+def _moved(program):
     """Numbers of elements of the arrays that devices exchange, by the kind of exchange."""
-    moved: dict[str, list[int]] = {kind: [] for kind in COLLECTIVES.split("|")}
+    moved = {kind: [] for kind in COLLECTIVES.split("|")}
     pattern = rf"= (.*?) ({COLLECTIVES})(?:-start)?\("
     for result, kind in re.findall(pattern, program.as_text()):
         for shape in re.findall(r"\w+\[([\d,]*)\]", result):
@@ -86,7 +73,7 @@ def _moved(program: Any) -> dict[str, list[int]]:
     return moved
 
 
-def _num_operations(program: Any) -> float:
+def _num_operations(program):
     return program.cost_analysis()["flops"]
 
 
@@ -100,9 +87,7 @@ def _num_operations(program: Any) -> float:
         pytest.param("dinorade_resnet50", 8, marks=pytest.mark.slow),
     ],
 )
-def test_devices_share_the_work_of_a_step_and_send_only_gradients(
-    kind: str, num_devices: int
-) -> None:
+def test_devices_share_the_work_of_a_step_and_send_only_gradients(kind, num_devices):
     one, arguments = _compiled(kind, 1)
     program, shared = _compiled(kind, num_devices)
     moved = _moved(program)
@@ -132,7 +117,7 @@ def test_devices_share_the_work_of_a_step_and_send_only_gradients(
         pytest.param("dinorade_resnet50", marks=pytest.mark.slow),
     ],
 )
-def test_only_parameters_are_gathered_if_they_are_split(kind: str) -> None:
+def test_only_parameters_are_gathered_if_they_are_split(kind):
     program, arguments = _compiled(kind, 4, "fsdp")
     moved = _moved(program)
     parameters = [x.size for x in jax.tree.leaves(arguments[0].params)]
@@ -145,15 +130,14 @@ def test_only_parameters_are_gathered_if_they_are_split(kind: str) -> None:
     chex.assert_trees_all_close(actual.params, expected.params, rtol=1e-4, atol=1e-5)
 
 
-def test_devices_share_the_work_of_inference_and_gather_only_detections() -> None:
+def test_devices_share_the_work_of_inference_and_gather_only_detections():
     inputs = _case("dinorade")[1].model_inputs()
     settings = Settings.of(Config(), {"score_threshold": 0.1})
     programs = []
     for num_devices in (1, 4):
         mesh = devices.make_mesh(num_devices)
-        detector = small_models.detector(
-            "camera", sharding=devices.batch_sharding(mesh)
-        )
+        sharding = devices.batch_sharding(mesh)
+        detector = small_models.detector("camera", sharding=sharding)
         arguments = detector.variables, *jax.tree.map(detector.put, inputs), settings
         program = detector._run.lower(*arguments).compile()
         programs.append((program, program(*arguments)))

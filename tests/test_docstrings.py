@@ -7,7 +7,6 @@ import ast
 import doctest
 import importlib
 import pathlib
-from collections.abc import Iterator
 
 import pytest
 
@@ -17,7 +16,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[1]
 Documented = ast.FunctionDef | ast.ClassDef
 
 
-def _documented(node: ast.AST, prefix: str) -> Iterator[tuple[str, Documented]]:
+def _documented(node, prefix):
     for child in ast.iter_child_nodes(node):
         if isinstance(child, Documented):
             name = f"{prefix}.{child.name}"
@@ -39,10 +38,10 @@ EXAMPLES = {
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_examples_run(name: str) -> None:
+def test_examples_run(name):
     module, text = EXAMPLES[name]
     names = dict(vars(importlib.import_module(module)))
     example = doctest.DocTestParser().get_doctest(text, names, name, module, 0)
-    said: list[str] = []
+    said = []
     doctest.DocTestRunner().run(example, out=said.append)
     assert not said, "".join(said)

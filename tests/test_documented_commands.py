@@ -19,11 +19,7 @@ from radejax.cli.train import train
 from radejax.config import load_config, with_texts
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
-PAGES = [
-    ROOT / "README.md",
-    ROOT / "CONTRIBUTING.md",
-    *sorted((ROOT / "docs").glob("*.md")),
-]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md"))]
 PROGRAMS = ("python", "python3", "radejax")
 
 # Scripts; the other files are modules that they import.
@@ -35,7 +31,7 @@ SCRIPTS = sorted(
 )
 
 
-def _commands() -> list[tuple[str, str]]:
+def _commands():
     """(page, command): lines of fenced blocks, and inline code with arguments."""
     found = []
     for page in PAGES:
@@ -62,7 +58,7 @@ by_command = pytest.mark.parametrize(
 
 
 @by_command
-def test_a_documented_command_is_understood(page: str, command: str) -> None:
+def test_a_documented_command_is_understood(page, command):
     words = shlex.split(command, comments=True)
     program, arguments = words[0], words[1:]
     if program == "radejax" and arguments[0] == "train":
@@ -75,12 +71,12 @@ def test_a_documented_command_is_understood(page: str, command: str) -> None:
         assert words[:2] == ["python3", "-m"]
 
 
-def _without_placeholders(arguments: list[str]) -> list[str]:
+def _without_placeholders(arguments):
     """Remove the brackets of optional arguments: `[--records DIR]`."""
     return [word.strip("[]") for word in arguments]
 
 
-def _check_radejax(arguments: list[str], command: click.Command = main.main) -> None:
+def _check_radejax(arguments, command=main.main):
     """All options exist and no required parameter is missing."""
     while isinstance(command, click.Group):
         name = arguments[0]
@@ -95,7 +91,7 @@ def _check_radejax(arguments: list[str], command: click.Command = main.main) -> 
         assert given.get(parameter.name) or not parameter.required, parameter.name
 
 
-def _check_script(script: str, arguments: list[str]) -> None:
+def _check_script(script, arguments):
     path = ROOT / script
     assert path.is_file(), f"no such script: {script}"
     flags = [word for word in arguments if word.startswith("--")]
@@ -109,7 +105,7 @@ def _check_script(script: str, arguments: list[str]) -> None:
     _check_train(arguments)
 
 
-def _check_train(arguments: list[str]) -> None:
+def _check_train(arguments):
     """Config, its options, fields and their values exist."""
     if not arguments:  # only the name is mentioned
         return
@@ -128,7 +124,7 @@ def _check_train(arguments: list[str]) -> None:
 
 
 @functools.cache
-def _help(script: str) -> str:
+def _help(script):
     """Output of `python script --help`, run in this process to share imports."""
     path = ROOT / script
     output = io.StringIO()
@@ -142,5 +138,5 @@ def _help(script: str) -> str:
 
 
 @pytest.mark.parametrize("script", SCRIPTS)
-def test_a_script_explains_itself(script: str) -> None:
+def test_a_script_explains_itself(script):
     assert _help(script).lower().startswith("usage: ")

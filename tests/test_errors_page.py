@@ -4,7 +4,6 @@ import ast
 import functools
 import pathlib
 import re
-from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -26,7 +25,7 @@ LEAST = 4
 """Length from which a fixed part of a message must be in the source."""
 
 
-def _messages() -> list[str]:
+def _messages():
     """Messages of the page, each on one line."""
     page = (ROOT / "docs" / "errors.md").read_text(encoding="utf-8")
     blocks = re.findall(r"^```text\n(.*?)^```", page, re.DOTALL | re.MULTILINE)
@@ -39,7 +38,7 @@ MESSAGES = _messages()
 # The source ---------------------------------------------------------------------------
 
 
-def _fixed_parts(node: ast.expr) -> list[str] | None:
+def _fixed_parts(node):
     """Fixed parts of a text between its values: of "a{x}b" and "a%sb" ["a", "b"]."""
     if isinstance(node, ast.Constant) and isinstance(node.value, str):
         return re.split(r"%(?:\.\d+)?[dfgrs]", node.value.replace("%%", "%"))
@@ -54,7 +53,7 @@ def _fixed_parts(node: ast.expr) -> list[str] | None:
     return parts
 
 
-def _texts(tree: ast.AST) -> Iterator[list[str]]:
+def _texts(tree):
     """Fixed parts of every text of a module, and of what `require` composes of some."""
     for node in ast.walk(tree):
         if isinstance(node, ast.expr) and (parts := _fixed_parts(node)):
@@ -72,7 +71,7 @@ TEXTS = {
 }
 
 
-def _is_in_source(message: str) -> bool:
+def _is_in_source(message):
     """Whether texts of the source compose the message; a value may be another text."""
     if all(len(word) < LEAST for word in HOLE.split(message)):
         return True
@@ -87,13 +86,13 @@ def _is_in_source(message: str) -> bool:
     return False
 
 
-def test_every_message_is_in_the_source() -> None:
+def test_every_message_is_in_the_source():
     assert len(MESSAGES) > 30
     assert len(set(MESSAGES)) == len(MESSAGES)
     assert [message for message in MESSAGES if not _is_in_source(message)] == []
 
 
-def test_a_changed_message_is_not_in_the_source() -> None:
+def test_a_changed_message_is_not_in_the_source():
     for message in MESSAGES:
         word = max(re.findall(r"\w+", HOLE.sub("", message)), key=len)
         assert not _is_in_source(message.replace(word, f"{word}ness")), message
@@ -102,34 +101,34 @@ def test_a_changed_message_is_not_in_the_source() -> None:
 # Provoked errors ----------------------------------------------------------------------
 
 
-def _is_described(text: str) -> bool:
+def _is_described(text):
     patterns = [".+".join(map(re.escape, HOLE.split(message))) for message in MESSAGES]
     return any(re.fullmatch(f"(.+: )?{pattern}", text) for pattern in patterns)
 
 
 @functools.cache
-def _dinorade() -> object:
+def _dinorade():
     return build(configs.load_config("dinorade").model)
 
 
-def _other_labels(folder: pathlib.Path) -> None:
+def _other_labels(folder):
     write_kradar(folder, sequences=(1,), num_frames=2)
     KRadar(folder, version="v1.0").summary()
 
 
-def _other_sequences(folder: pathlib.Path) -> None:
+def _other_sequences(folder):
     write_kradar(folder, sequences=(1,), num_frames=2)
     KRadar(folder, sequences=(1, 9))
 
 
-def _no_images(folder: pathlib.Path) -> None:
+def _no_images(folder):
     write_kradar(folder, sequences=(1,), num_frames=2)
     frames = KRadar(folder)
     found = cameras.camera_inputs(frames, small.IMAGE_SIZE, CameraOptions())
     cameras.require_images(frames, found)
 
 
-PROVOKED: list[Callable[[pathlib.Path], object]] = [
+PROVOKED = [
     lambda _: configs.check_bins(Config().model, GRID, "the data"),
     _other_sequences,
     _other_labels,
@@ -140,9 +139,7 @@ PROVOKED: list[Callable[[pathlib.Path], object]] = [
 
 
 @pytest.mark.parametrize("provoke", PROVOKED)
-def test_the_page_has_the_text_of_the_error(
-    provoke: Callable[[pathlib.Path], object], tmp_path: pathlib.Path
-) -> None:
+def test_the_page_has_the_text_of_the_error(provoke, tmp_path):
     with pytest.raises((UserError, DataError)) as caught:
         provoke(tmp_path)
     assert _is_described(str(caught.value)), str(caught.value)

@@ -6,23 +6,20 @@ import pathlib
 import re
 import shutil
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
+from unittest import mock
 
 import jax
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from PIL import Image
 
 import radejax
 from radejax import models
-from radejax.cli.main import main
 from radejax.config import Config
 from radejax.core.errors import UserError
 from radejax.data.check import check_frames
-from radejax.data.dataset import LabeledFrames, find_reader
+from radejax.data.dataset import find_reader
 from radejax.data.kradar import KRadar
 from radejax.data.kradar.check import check_dataset
 from radejax.data.options import DataOptions
@@ -36,43 +33,38 @@ from radejax.inference.export import export
 from radejax.runs import experiment
 from radejax.runs.data import Data, located
 from radejax.runs.evaluate import evaluate_run
-from radejax.visualize.style import Scene
 
 from . import small_models as small
 from . import toy_reader
+from .commands import run
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
-BLOCKS = re.findall(
-    r"^```python\n(.*?)^```",
-    (ROOT / "docs" / "extending.md").read_text(encoding="utf-8"),
-    re.MULTILINE | re.S,
-)
-RADAR_BLOCKS = re.findall(
-    r"^```py\n(.*?)^```",
-    (ROOT / "docs" / "own_radar.md").read_text(encoding="utf-8"),
-    re.MULTILINE | re.S,
-)
+
+
+def _blocks(page, language):
+    text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.S)
 
 
 @pytest.fixture(autouse=True)
-def page(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def page(tmp_path, monkeypatch):
     """Save the reader and the blocks of the page as modules that Python finds."""
     folder = tmp_path / "modules"
     folder.mkdir()
     monkeypatch.syspath_prepend(folder)
-    (folder / "parts.py").write_text("\n\n".join(BLOCKS))
+    (folder / "parts.py").write_text("\n\n".join(_blocks("extending.md", "python")))
     shutil.copy(toy_reader.__file__, folder / "toy.py")
     yield
     _forget()
 
 
-def _forget() -> None:
+def _forget():
     """Remove the imported modules, as if a new process had started."""
     for name in ("toy", "parts"):
         sys.modules.pop(name, None)
 
 
-def _config() -> Config:
+def _config():
     """Config of the small model with every component of the page."""
     parts = importlib.import_module("parts")
     config = small.radar_config()
@@ -114,7 +106,7 @@ def _config() -> Config:
     )
 
 
-def _write_toy(root: pathlib.Path) -> pathlib.Path:
+def _write_toy(root):
     """Write two drives of two frames, the first frame with an image."""
     rng, grid = np.random.default_rng(0), small.small_grid()
     (root / "1").mkdir(parents=True)
@@ -137,12 +129,12 @@ def _write_toy(root: pathlib.Path) -> pathlib.Path:
     return root
 
 
-def _read_toy(root: pathlib.Path) -> LabeledFrames:
+def _read_toy(root):
     options = DataOptions(format="toy:Toy", roots=(str(root),))
     return find_reader(options.format).from_options(options, ("Sedan",))
 
 
-def test_configs_may_name_the_parts_and_the_model_has_them() -> None:
+def test_configs_may_name_the_parts_and_the_model_has_them():
     model = models.build(_config().model)
     assert model.options.exponent == 3.0
     projection = jax.ShapeDtypeStruct((1, 16, 14, 5), "float32")
@@ -153,14 +145,12 @@ def test_configs_may_name_the_parts_and_the_model_has_them() -> None:
 
 
 def test_records_of_other_files_or_of_another_reader_are_reported(
-    tmp_path: pathlib.Path,
-    caplog: pytest.LogCaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    tmp_path, caplog, monkeypatch
+):
     root, reader = _write_toy(tmp_path), find_reader("toy:Toy")
     toy = sys.modules["toy"]
 
-    def again() -> str:
+    def again():
         caplog.clear()
         with caplog.at_level("INFO", "radejax"):
             preprocess(_read_toy(root), tmp_path / "records")
@@ -188,71 +178,53 @@ def test_records_of_other_files_or_of_another_reader_are_reported(
         with pytest.raises(UserError, match=r"2/0001 is not what the reader computes"):
             preprocess(data, tmp_path / "records")
     monkeypatch.setattr(reader, "reader_version", "2")
-    with pytest.raises(
-        UserError, match=r"other records: options.source.reader is \['toy:Toy', ''"
-    ):
+    with pytest.raises(UserError, match=r"source.reader is \['toy:Toy', ''"):
         again()
 
 
-def test_commands_read_such_data_by_the_config(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_commands_read_such_data_by_the_config(tmp_path, monkeypatch):
     root = _write_toy(tmp_path / "toy")
     config = Config().replace(data={"format": "toy:Toy"}, evaluation={"roi": None})
     given = ["--config", small.write_config(tmp_path / "config.py", config)]
 
-    def run(*words: object, code: int = 0) -> str:
-        done = CliRunner().invoke(main, [str(word) for word in words])
-        assert done.exit_code == code, done.output
-        return done.output
-
-    report = json.loads(run("data", "check", root, *given, "--deep", "--json"))
+    report = json.loads(run("data", "check", root, *given, "--deep", "--json").stdout)
     assert report["version"] == "read by toy:Toy"
     assert [row["without_camera"] for row in report["sequences"]] == [1, 2]
-    assert [(row["train"], row["test"]) for row in report["sequences"]] == [
-        (2, 0),
-        (0, 2),
-    ]
+    assert [row["train"] for row in report["sequences"]] == [2, 0]
+    assert [row["test"] for row in report["sequences"]] == [0, 2]
     train = {row["split"]: row for row in report["objects"]}["train"]
     assert (train["Sedan"], report["summary"]["num_problems"]) == (2, 0)
 
     out = tmp_path / "records"
     text = run("preprocess", root, *given, "--out", out, "--sequences", 2)
-    assert "2 preprocessed" in text
+    assert "2 preprocessed" in text.output
     assert Records.open(out).keys() == {"2/0001", "2/0002"}
 
-    scenes: list[Scene] = []
-    drawn = radejax.draw_frame
-    monkeypatch.setattr(
-        radejax, "draw_frame", lambda scene: scenes.append(scene) or drawn(scene)
-    )
+    draw = mock.Mock(wraps=radejax.draw_frame)
+    monkeypatch.setattr(radejax, "draw_frame", draw)
     out = tmp_path / "a.png"
     given += ["--data", root, "--out", out]
-    assert run("overlay", "1/0001", *given) == f"drew {out}\n"
-    text = run("overlay", "1/0002", *given)
+    assert run("overlay", "1/0001", *given).output == f"drew {out}\n"
+    text = run("overlay", "1/0002", *given).output
     assert "1 of 1 frames have no front image, 0 no camera" in text
-    both, radar = scenes
+    scenes = both, radar = [call.args[0] for call in draw.call_args_list]
     assert both.image is not None
     assert both.camera is not None
     assert radar.image is None
     assert [len(scene.ground_truth or ()) for scene in scenes] == [1, 1]
-    assert "leave it out" in run("overlay", "1/0002", *given, "--lidar", code=2)
-    assert "no frames of these" in run("overlay", "7/0001", *given, code=2)
+    text = run("overlay", "1/0002", *given, "--lidar", code=2).output
+    assert "leave it out" in text
+    assert "no frames of these" in run("overlay", "7/0001", *given, code=2).output
 
 
-def test_objects_that_cannot_be_learned_are_left_out_and_counted(
-    tmp_path: pathlib.Path,
-) -> None:
+def test_objects_that_cannot_be_learned_are_left_out_and_counted(tmp_path):
     root = _write_toy(tmp_path)
     path = root / "1" / "0001.npz"
     good = [12.0, 1.0, 0.0, 4.2, 1.8, 1.6, 0.1]
     boxes = np.array([good] * 5)
     boxes[1, 2], boxes[2, 4], boxes[3, 0], boxes[4, 1] = np.nan, -1.0, -12.0, 99.0
-    content = dict(np.load(path)) | {
-        "boxes": boxes,
-        "classes": np.array(["Sedan"] * 5),
-        "velocity_mps": np.zeros((5, 2)),
-    }
+    content = dict(np.load(path)) | {"boxes": boxes, "velocity_mps": np.zeros((5, 2))}
+    content["classes"] = np.array(["Sedan"] * 5)
     np.savez(path, **content)
     config = located(_config().replace(data={"roots": (str(root),)}))
     data = Data(config)
@@ -272,16 +244,12 @@ def test_objects_that_cannot_be_learned_are_left_out_and_counted(
         Data(config)
 
 
-def test_what_a_reader_forgets_is_named(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_reader_forgets_is_named(tmp_path, monkeypatch):
     root = _write_toy(tmp_path)
     toy, classes = importlib.import_module("toy"), ("Sedan",)
     frames = list(_read_toy(root))
     grid = small.small_grid()
-    with pytest.raises(
-        UserError, match="number of frames 1/0001 is 2, expected 1: oth"
-    ):
+    with pytest.raises(UserError, match="number of frames 1/0001 is 2, expected 1:"):
         toy.Toy([*frames, frames[0]], grid).with_valid_boxes(classes)
     uncalibrated = [replace(x, camera_calibration_path=None) for x in frames]
     counts = toy.Toy(uncalibrated, grid).with_valid_boxes(classes).counts
@@ -325,15 +293,13 @@ def test_what_a_reader_forgets_is_named(
 
 
 @pytest.mark.parametrize("is_flat", [False, True])
-def test_written_folders_are_read(
-    is_flat: bool, tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_written_folders_are_read(is_flat, tmp_path, monkeypatch):
     """Also those of a radar that measures only range and azimuth, with one bin per axis."""
-    (written,) = (block for block in RADAR_BLOCKS if "write_splits" in block)
+    blocks = _blocks("own_radar.md", "py")
+    (written,) = (block for block in blocks if "write_splits" in block)
     if is_flat:
-        written, count = re.subn(
-            r"(elevation_rad|doppler_mps)=.*", r"\1=[0.0],", written
-        )
+        axes = r"(elevation_rad|doppler_mps)=.*"
+        written, count = re.subn(axes, r"\1=[0.0],", written)
         assert count == 2
     monkeypatch.chdir(tmp_path)
     shape = (1, 64, 1, 48) if is_flat else (32, 64, 2, 48)
@@ -360,7 +326,7 @@ def test_written_folders_are_read(
         ("data.format", "nuscenes", "'nuscenes', expected 'kradar' or module:Object"),
     ],
 )
-def test_a_wrong_part_is_named(name: str, value: Any, message: str) -> None:
+def test_a_wrong_part_is_named(name, value, message):
     config, section = _config(), name.partition(".")[0]
     with pytest.raises(UserError, match=rf"^config\.{section}\..*{message}"):
         config.with_fields({name: value}).check_imports()
@@ -368,18 +334,15 @@ def test_a_wrong_part_is_named(name: str, value: Any, message: str) -> None:
 
 @pytest.mark.slow
 def test_own_parts_are_imported_wherever_a_run_is_opened(
-    tmp_path: pathlib.Path,
-    caplog: pytest.LogCaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
-    one_device: jax.sharding.Mesh,
-) -> None:
+    tmp_path, caplog, monkeypatch, one_device
+):
     """One step on the toy data, then each command as if in a process of its own."""
     root, folder = _write_toy(tmp_path / "toy"), tmp_path / "run"
     config = _config()
     classes = ("Tram", *config.classes[1:])
     config = config.replace(data={"roots": (str(root),)}, classes=classes)
     experiment.run(config, folder, mesh=one_device)
-    row: dict[str, Any] = json.loads((folder / "metrics.jsonl").read_text())
+    row = json.loads((folder / "metrics.jsonl").read_text())
     assert row["step"] == 1
     terms = ("focal", "gwd", "height_loss", "velocity_loss")
     assert np.isfinite([row[name] for name in terms]).all()
@@ -416,7 +379,5 @@ def test_own_parts_are_imported_wherever_a_run_is_opened(
     assert again(projection, score_threshold=0.0).boxes.shape[-1] == 7
     monkeypatch.undo()  # the folder of parts.py is not searched any more
     _forget()
-    with pytest.raises(
-        UserError, match=r"is 'parts:\w+': No module named 'parts'; run"
-    ):
+    with pytest.raises(UserError, match=r"is 'parts:\w+': No module named 'parts';"):
         Detector.from_workdir(folder)

@@ -6,7 +6,6 @@ import pathlib
 import runpy
 import subprocess
 import sys
-from collections.abc import Iterator
 
 import pytest
 
@@ -32,7 +31,7 @@ UPWARD = {"radejax.config -> radejax.training.options"}
 LAYER = {package: i for i, layer in enumerate(LAYERS) for package in layer}
 
 
-def _modules() -> dict[str, ast.Module]:
+def _modules():
     """Syntax tree of every module by its dotted name."""
     found = {}
     for path in sorted(PACKAGE.rglob("*.py")):
@@ -45,10 +44,10 @@ def _modules() -> dict[str, ast.Module]:
 MODULES = _modules()
 
 
-def _imports(tree: ast.Module) -> Iterator[str]:
+def _imports(tree):
     """Modules of radejax that a module imports, inside functions as well."""
     for node in ast.walk(tree):
-        names: list[str] = []
+        names = []
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -64,16 +63,16 @@ def _imports(tree: ast.Module) -> Iterator[str]:
 GRAPH = {name: set(_imports(tree)) - {name} for name, tree in MODULES.items()}
 
 
-def _package(module: str) -> str:
+def _package(module):
     return module.split(".")[1]
 
 
-def test_every_package_has_a_layer() -> None:
+def test_every_package_has_a_layer():
     found = {_package(name) for name in GRAPH if name != "radejax"}
     assert found == set(LAYER) - {"configs"}  # a link to configs/, which is not walked
 
 
-def test_packages_import_only_from_lower_layers() -> None:
+def test_packages_import_only_from_lower_layers():
     wrong = {
         f"{source} -> {target}"
         for source, targets in GRAPH.items()
@@ -83,26 +82,22 @@ def test_packages_import_only_from_lower_layers() -> None:
         if LAYER[_package(source)] <= LAYER[_package(target)]
     }
     assert wrong == UPWARD
-    core = {
-        f"{s} -> {t}" for s in GRAPH if s.startswith("radejax.core") for t in GRAPH[s]
-    }
-    assert all(".core." in line.partition(" -> ")[2] for line in core)
+    of_core = [GRAPH[name] for name in GRAPH if name.startswith("radejax.core")]
+    assert all(".core." in target for target in set.union(*of_core))
 
 
-def test_modules_have_no_import_cycles() -> None:
+def test_modules_have_no_import_cycles():
     graph = {name: targets for name, targets in GRAPH.items() if name != "radejax"}
     graphlib.TopologicalSorter(graph).prepare()  # raises CycleError
 
 
-def test_windows_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_windows_is_named(monkeypatch):
     monkeypatch.setattr(sys, "platform", "win32")
-    with pytest.raises(
-        ImportError, match="radejax runs on Linux and macOS; on Windows"
-    ):
+    with pytest.raises(ImportError, match="radejax runs on Linux and macOS; on"):
         runpy.run_path(str(PACKAGE / "__init__.py"))
 
 
-def test_imports_are_few_and_change_neither_logging_nor_signals() -> None:
+def test_imports_are_few_and_change_neither_logging_nor_signals():
     """Commands load only the libraries that they need."""
     code = (
         "import importlib, logging, pkgutil, signal, sys\n"

@@ -9,7 +9,7 @@ PAGE = pathlib.Path(__file__).resolve().parents[1] / "docs" / "jax_for_pytorch.m
 
 
 @pytest.mark.slow
-def test_the_blocks_run(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_blocks_run(capsys):
     blocks = re.findall(r"^```python\n(.*?)^```", PAGE.read_text("utf-8"), re.M | re.S)
     assert len(blocks) >= 6
     exec("\n".join(blocks), {})

@@ -16,7 +16,7 @@ by_name = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
 
 @pytest.fixture(scope="session")
-def work(tmp_path_factory) -> pathlib.Path:
+def work(tmp_path_factory):
     """Folder of the notebooks' runs and data: that of `.ci/run quickstart` if RADEJAX_WORK is set;
     otherwise the first notebook that needs a run trains a short one.
     """
@@ -24,7 +24,7 @@ def work(tmp_path_factory) -> pathlib.Path:
     return pathlib.Path(given) if given else tmp_path_factory.mktemp("notebooks")
 
 
-def code_cells(path: pathlib.Path) -> list[dict]:
+def code_cells(path):
     notebook = json.loads(path.read_text(encoding="utf-8"))
     return [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
 

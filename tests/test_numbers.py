@@ -9,8 +9,6 @@ import json
 import pathlib
 import re
 import statistics
-from collections.abc import Iterable, Iterator
-from typing import Any
 
 import pytest
 
@@ -52,7 +50,7 @@ OTHERS = {
 """Numbers that are not results in the stored files, and what they are."""
 
 
-def _ablation_rows(rows: list[dict[str, Any]]) -> Iterator[str]:
+def _ablation_rows(rows):
     """The APs of each cell in all conditions together, in the order of the file."""
     for cell in {row["cell"] for row in rows}:
         yield " ".join(
@@ -62,22 +60,21 @@ def _ablation_rows(rows: list[dict[str, Any]]) -> Iterator[str]:
         )
 
 
-def _realistic_rows() -> Iterator[str]:
+def _realistic_rows():
     """Means and standard deviations of the quickstart's seeds, and APs of CFAR."""
     stored = json.loads((REPORTS / "ablations/quickstart_realistic.json").read_text())
     for protocol in ("all_point", "kradar_r40"):
         for seeds in stored["ap"].values():
             names = [name for name in seeds["seed 0"] if name.startswith(protocol)]
             aps = [[seed[name] for seed in seeds.values()] for name in names]
-            means = [
-                f"{statistics.mean(x):.1f} ± {statistics.stdev(x):.1f}" for x in aps
-            ]
+            spreads = [(statistics.mean(x), statistics.stdev(x)) for x in aps]
+            means = [f"{mean:.1f} ± {std:.1f}" for mean, std in spreads]
             yield from (" ".join(means), *means)
         cfar = stored["cfar"]["difference"].items()
         yield _row(x["CFAR"] for name, x in cfar if name.startswith(protocol))
 
 
-def _robustness_rows() -> Iterator[str]:
+def _robustness_rows():
     """A radar or field, and its APs: of two trainings, or of its lowest and highest value."""
     stored = json.loads((REPORTS / "ablations/robustness.json").read_text())
     realistic = stored["trained on realistic"]["ap"]
@@ -90,13 +87,11 @@ def _robustness_rows() -> Iterator[str]:
     models = stored["augmentation"]["ap"].values()
     for name in next(iter(models)):
         row = _row(ap[name] for ap in models if name in ap)
-        yield from (
-            f"{name} {row}",
-            f"{name.split()[0]} {row}",
-        )  # whole numbers are no APs
+        yield f"{name} {row}"
+        yield f"{name.split()[0]} {row}"  # whole numbers are no APs
 
 
-def _calibration_rows() -> Iterator[str]:
+def _calibration_rows():
     """Lowest score, calibration errors of score and probability, ratio and its interval."""
     stored = json.loads((REPORTS / "calibration.json").read_text())
     for row in stored["calibration_errors"]:
@@ -105,11 +100,11 @@ def _calibration_rows() -> Iterator[str]:
         yield f"{row['min_score']} {errors} {row['ratio']:.2f} {low:.2f} {high:.2f}"
 
 
-def _row(aps: Iterable[float]) -> str:
+def _row(aps):
     return " ".join(f"{ap:.1f}" for ap in aps)
 
 
-def _objects(value: Any) -> Iterator[dict[str, Any]]:
+def _objects(value):
     """All objects of a JSON value."""
     if isinstance(value, dict):
         yield value
@@ -120,7 +115,7 @@ def _objects(value: Any) -> Iterator[dict[str, Any]]:
 
 
 @pytest.fixture(scope="module")
-def stored() -> set[str]:
+def stored():
     """Rows, differences and times as the pages print them."""
     published = ROOT / "radejax" / "evaluation" / "published.csv"
     found = {*APS_OF_PAPERS.findall(published.read_text(encoding="utf-8"))}
@@ -136,7 +131,7 @@ def stored() -> set[str]:
     return found
 
 
-def _printed(page: str) -> Iterator[str]:
+def _printed(page):
     """Differences, rows of tables, and numbers in sentences of a page."""
     text = re.sub(r"```.*?```|\]\([^)]*\)", "", page, flags=re.DOTALL)
     for block in text.split("\n\n"):
@@ -146,9 +141,8 @@ def _printed(page: str) -> Iterator[str]:
                 cells = list(zip(map(str.strip, header), row, strict=True))
                 for name, cell in cells:
                     yield from APS_OF_PAPERS.findall(cell) if name in QUOTED else ()
-                own = " ".join(
-                    x for name, x in cells if name not in (*QUOTED, "variant")
-                )
+                left_out = (*QUOTED, "variant")
+                own = " ".join(x for name, x in cells if name not in left_out)
                 yield from DIFFERENCE.findall(own)
                 if numbers := NUMBER.findall(DIFFERENCE.sub("", own)):
                     yield " ".join([*re.findall(r"`(\w+)`", row[0]), *numbers])
@@ -159,14 +153,14 @@ def _printed(page: str) -> Iterator[str]:
 
 
 @pytest.mark.parametrize("name", ["README.md", "docs/quickstart.md", "docs/results.md"])
-def test_printed_numbers_are_stored(name: str, stored: set[str]) -> None:
+def test_printed_numbers_are_stored(name, stored):
     printed = list(_printed((ROOT / name).read_text(encoding="utf-8")))
     assert len(printed) > 3
     lost = [x for x in printed if x not in stored and not {*x.split()} <= OTHERS.keys()]
     assert lost == [], "neither in a JSON file of docs/reports nor in OTHERS"
 
 
-def test_the_tables_of_the_simulated_radar_are_stored() -> None:
+def test_the_tables_of_the_simulated_radar_are_stored():
     """The numbers of a cell are the first ones that are stored of its statistic."""
     stored = json.loads((REPORTS / "simulator_statistics.json").read_text())
     page = (ROOT / "docs" / "simulated_radar.md").read_text(encoding="utf-8")
@@ -182,7 +176,7 @@ def test_the_tables_of_the_simulated_radar_are_stored() -> None:
                     _check_cell(cell, stored[column][row[0]])
 
 
-def _check_cell(cell: str, values: list[float]) -> None:
+def _check_cell(cell, values):
     printed = re.findall(r"[-+]?\d+(?:\.\d+)?", cell)
     assert printed
     for text, value in zip(printed, values[: len(printed)], strict=True):

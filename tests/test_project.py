@@ -10,7 +10,7 @@ import radejax
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 
 
-def test_citation_and_changelog_are_of_this_version() -> None:
+def test_citation_and_changelog_are_of_this_version():
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     assert citation["version"] == radejax.__version__
     changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")

@@ -6,7 +6,7 @@ import pathlib
 import radejax
 
 
-def test_editors_and_type_checkers_see_every_public_name() -> None:
+def test_editors_and_type_checkers_see_every_public_name():
     tree = ast.parse(pathlib.Path(radejax.__file__).read_text(encoding="utf-8"))
     declared = {
         alias.asname: (node.module, alias.name)

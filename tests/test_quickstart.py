@@ -1,25 +1,20 @@
 """A small quickstart through its commands, uninterrupted and killed."""
 
 import json
-import os
-import pathlib
 import signal
-import subprocess
-import sys
 import time
-from collections.abc import Callable
 
 import jax
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
 
-from radejax.cli import main
 from radejax.inference.saved import load_model
+
+from . import processes
+from .commands import run
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
-REPOSITORY = pathlib.Path(__file__).resolve().parents[1]
 OVERRIDES = [
     "--config=configs/quickstart.py:short",
     "--config.simulation.train_sequences=2",
@@ -33,49 +28,33 @@ OVERRIDES = [
 ]
 
 
-def _environment() -> dict[str, str]:
-    return {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONUNBUFFERED": "1"}
+def _start(folder):
+    places = [f"--workdir={folder / 'run'}", f"--data={folder / 'data'}"]
+    (process,) = processes.start(1, "train.py", *OVERRIDES, *places)
+    return process
 
 
-def _start(folder: pathlib.Path, *more: str) -> subprocess.Popen:
-    command = [sys.executable, "train.py", *OVERRIDES, *more]
-    command += [f"--workdir={folder / 'run'}", f"--data={folder / 'data'}"]
-    return subprocess.Popen(
-        command,
-        cwd=REPOSITORY,
-        env=_environment(),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-
-
-def _finish(process: subprocess.Popen) -> str:
+def _finish(process):
     output, _ = process.communicate(timeout=600)
     assert process.returncode == 0, output
     return output
 
 
-def _radejax(*arguments: object) -> Result:
-    """`evaluate.py` is `radejax evaluate`."""
-    return CliRunner().invoke(main.main, [str(argument) for argument in arguments])
-
-
-def _metrics(folder: pathlib.Path) -> dict:
+def _metrics(folder):
     path = folder / "run" / "evaluation" / "metrics.json"
-    metrics: dict = json.loads(path.read_text())
+    metrics = json.loads(path.read_text())
     del metrics["date"]
     return metrics
 
 
 @pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> tuple[pathlib.Path, str]:
+def undisturbed(tmp_path_factory):
     """An uninterrupted run: its folder and its output."""
     folder = tmp_path_factory.mktemp("undisturbed")
     return folder, _finish(_start(folder))
 
 
-def test_from_an_empty_folder_to_metrics_and_figures(undisturbed: tuple) -> None:
+def test_from_an_empty_folder_to_metrics_and_figures(undisturbed):
     folder, output = undisturbed
     stages = ("simulate", "preprocess", "train", "detect", "Done in")
     assert all(line in output for line in stages)
@@ -95,52 +74,42 @@ def test_from_an_empty_folder_to_metrics_and_figures(undisturbed: tuple) -> None
     jax.tree.map(np.testing.assert_array_equal, found.variables, expected.variables)
 
 
-def test_evaluate_reproduces_the_table_and_detect_writes_boxes(
-    undisturbed: tuple,
-) -> None:
+def test_evaluate_reproduces_the_table_and_detect_writes_boxes(undisturbed):
     folder, _ = undisturbed
     first = _metrics(folder)
     # A process of its own: to the last digit on as many devices as in training.
-    subprocess.run(
-        [sys.executable, "evaluate.py", f"--workdir={folder / 'run'}"],
-        cwd=REPOSITORY,
-        env=_environment(),
-        check=True,
-        capture_output=True,
-        timeout=600,
-    )
+    (process,) = processes.start(1, "evaluate.py", f"--workdir={folder / 'run'}")
+    _finish(process)
     assert _metrics(folder) == first
     words = [folder / "data" / "3", "--workdir", folder / "run"]
     words += ["--out", folder / "boxes", "--score-threshold", "0", "--json"]
-    done = _radejax("detect", *words)
+    done = run("detect", *words)
     assert json.loads(done.stdout)["frames"] == 6
     assert len(list((folder / "boxes").glob("3_*.json"))) == 6
 
 
-def _simulating(folder: pathlib.Path) -> bool:
+def _simulating(folder):
     return any((folder / "data").glob("2/info_label_v2_1/*.txt"))
 
 
-def _preprocessing(folder: pathlib.Path) -> bool:
+def _preprocessing(folder):
     return (folder / "data" / "records" / "manifest.json").exists()
 
 
-def _training(folder: pathlib.Path) -> bool:
+def _training(folder):
     checkpoints = folder / "run" / "checkpoints"
     steps = checkpoints.glob("[0-9]*")
     return any(path.name.isdigit() and int(path.name) >= 2 for path in steps)
 
 
-def _evaluating(folder: pathlib.Path) -> bool:
+def _evaluating(folder):
     """Whether an evaluation is running; it writes a temporary folder and moves its content."""
     return any((folder / "run").glob("evaluation/*.tmp"))
 
 
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("stage", [_simulating, _preprocessing, _training, _evaluating])
-def test_killed_at_any_stage_it_ends_in_the_same_digits(
-    stage: Callable[[pathlib.Path], bool], undisturbed: tuple, tmp_path: pathlib.Path
-) -> None:
+def test_killed_at_any_stage_it_ends_in_the_same_digits(stage, undisturbed, tmp_path):
     process = _start(tmp_path)
     while not stage(tmp_path):
         assert process.poll() is None, process.communicate()[0]

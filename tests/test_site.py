@@ -13,7 +13,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[1]
 pages = SimpleNamespace(**runpy.run_path(str(ROOT / "docs" / "site_pages.py"), {}, "p"))
 
 
-def test_a_site_without_a_public_name_is_rejected(tmp_path: pathlib.Path) -> None:
+def test_a_site_without_a_public_name_is_rejected(tmp_path):
     names = list(pages.public_names())
     assert "radejax.geometry.rotated_iou.bev_iou" in names
     assert "radejax.inference.detector.Detector.from_workdir" in names
@@ -25,7 +25,7 @@ def test_a_site_without_a_public_name_is_rejected(tmp_path: pathlib.Path) -> Non
     assert pages.missing(tmp_path) == names[:1]
 
 
-def test_linked_files_are_in_the_repository() -> None:
+def test_linked_files_are_in_the_repository():
     """Some readers see the pages in the repository, and not on the site."""
     pages = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")]
     lost = []
@@ -37,7 +37,7 @@ def test_linked_files_are_in_the_repository() -> None:
     assert lost == []
 
 
-def test_every_config_field_is_in_the_reference() -> None:
+def test_every_config_field_is_in_the_reference():
     text = pages.config_page()
     for config in ("dinorade", "quickstart_fusion"):
         names = {name for name, _ in load_config(config).fields()}
@@ -50,7 +50,7 @@ def test_every_config_field_is_in_the_reference() -> None:
 
 
 @pytest.mark.parametrize("folder", ["examples", "notebooks"])
-def test_the_gallery_lists_every_example(folder: str) -> None:
+def test_the_gallery_lists_every_example(folder):
     text = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
     index = text.partition("## By purpose")[2]
     listed = re.findall(rf"\]\(\.\./{folder}/([^)]+)\)", index)
@@ -58,7 +58,7 @@ def test_the_gallery_lists_every_example(folder: str) -> None:
     assert sorted(listed) == sorted(files)
 
 
-def test_links_outside_of_docs_lead_to_pages_of_the_site() -> None:
+def test_links_outside_of_docs_lead_to_pages_of_the_site():
     page = SimpleNamespace(file=SimpleNamespace(src_uri="how_it_works.md"))
     links = {
         "../radejax/losses/gwd.py": "reference/losses.md#radejax.losses.gwd",

@@ -1,17 +1,15 @@
 """Two processes that train one model together, against one process with two devices."""
 
 import json
-import pathlib
 import shutil
 import signal
-import subprocess
 import time
 
 import chex
 import numpy as np
 import pytest
 
-from radejax.config import Config, load_config
+from radejax.config import load_config
 from radejax.inference.saved import load_model
 from radejax.training.checkpoints import Checkpoints
 
@@ -23,7 +21,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 MIDDLE = 3  # of six steps
 
 
-def _config() -> Config:
+def _config():
     return small.shrink_run(load_config("quickstart:short")).replace(
         simulation={"train_sequences": 2, "frames_per_sequence": 5},
         model={"cbam": "off"},
@@ -37,9 +35,7 @@ def _config() -> Config:
     )
 
 
-def _start(
-    folder: pathlib.Path, run: str, num_processes: int, *overrides: str
-) -> list[subprocess.Popen]:
+def _start(folder, run, num_processes, *overrides):
     """Start train.py on two devices, in one process or in two."""
     config = small.write_config(folder / "config.py", _config())
     places = [f"--workdir={folder / run}", f"--data={folder / 'data'}"]
@@ -47,7 +43,7 @@ def _start(
     return processes.start(num_processes, *command, num_devices=2 // num_processes)
 
 
-def _train(folder: pathlib.Path, run: str, num_processes: int, *overrides: str) -> None:
+def _train(folder, run, num_processes, *overrides):
     started = _start(folder, run, num_processes, *overrides)
     outputs = processes.outputs_of(started, timeout_s=900)
     for process in started:
@@ -56,7 +52,7 @@ def _train(folder: pathlib.Path, run: str, num_processes: int, *overrides: str) 
     assert not any("Done in" in output for output in outputs[1:])
 
 
-def _cut(folder: pathlib.Path, run: str, to: str) -> None:
+def _cut(folder, run, to):
     """Copy of a run in the state of its middle."""
     shutil.copytree(folder / run, folder / to)
     for path in (folder / to / "checkpoints").iterdir():
@@ -65,20 +61,20 @@ def _cut(folder: pathlib.Path, run: str, to: str) -> None:
     shutil.rmtree(folder / to / "evaluation")
 
 
-def _losses(folder: pathlib.Path) -> list[tuple[int, list[float]]]:
+def _losses(folder):
     lines = (folder / "metrics.jsonl").read_text().splitlines()
     rows = [row for row in map(json.loads, lines) if "focal" in row]
     names = ("focal", "gwd", "smooth_l1", "grad_norm")
     return [(row["step"], [row[name] for name in names]) for row in rows]
 
 
-def _aps(folder: pathlib.Path) -> list:
+def _aps(folder):
     rows = (folder / "evaluation" / "metrics.csv").read_text().splitlines()
     return [row.split(",")[1:] for row in rows[1:]]
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+def runs(tmp_path_factory):
     """Folder with the runs "one" and "two", each also resumed by the other number of processes."""
     folder = tmp_path_factory.mktemp("processes")
     _train(folder, "two", 2)
@@ -91,21 +87,17 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
 
 
 @pytest.mark.parametrize("run", ["two", "two_then_one", "one_then_two"])
-def test_two_processes_equal_one(runs: pathlib.Path, run: str) -> None:
+def test_two_processes_equal_one(runs, run):
     expected, actual = _losses(runs / "one"), _losses(runs / run)
     assert [step for step, _ in actual] == list(range(1, 7))
-    np.testing.assert_allclose(
-        [v for _, v in actual], [v for _, v in expected], rtol=1e-5
-    )
-    chex.assert_trees_all_close(
-        load_model(runs / run).variables, load_model(runs / "one").variables, atol=1e-6
-    )
+    values = ([v for _, v in rows] for rows in (actual, expected))
+    np.testing.assert_allclose(*values, rtol=1e-5)
+    variables = (load_model(runs / name).variables for name in (run, "one"))
+    chex.assert_trees_all_close(*variables, atol=1e-6)
     assert _aps(runs / run) == _aps(runs / "one")
 
 
-def test_two_processes_run_several_seeds_and_evaluate_on_the_way(
-    runs: pathlib.Path,
-) -> None:
+def test_two_processes_run_several_seeds_and_evaluate_on_the_way(runs):
     # The second process must not read files that the first one is still writing.
     _train(
         runs,
@@ -121,18 +113,16 @@ def test_two_processes_run_several_seeds_and_evaluate_on_the_way(
     assert set(rows[0]["values"]) == {"0", "1"}
 
 
-def test_only_one_process_writes(runs: pathlib.Path) -> None:
+def test_only_one_process_writes(runs):
     files = [path.suffix for path in (runs / "two" / "tensorboard").iterdir()]
     assert files.count(".test") == len(files) - 1 == 1  # of the training and the report
     assert not list(runs.rglob("*.tmp"))
 
 
-def _start_long(folder: pathlib.Path, run: str) -> list[subprocess.Popen]:
+def _start_long(folder, run):
     """Start a long training in two processes, and wait for its first steps."""
-    long = [
-        "--config.train.num_epochs=2000",
-        "--config.train.checkpoint_every_steps=9999",
-    ]
+    fields = {"num_epochs": 2000, "checkpoint_every_steps": 9999}
+    long = [f"--config.train.{name}={value}" for name, value in fields.items()]
     started = _start(folder, run, 2, *long)
     path = folder / run / "metrics.jsonl"
     while not path.exists() or len(_losses(folder / run)) < MIDDLE:
@@ -142,9 +132,7 @@ def _start_long(folder: pathlib.Path, run: str) -> list[subprocess.Popen]:
 
 
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGUSR1", "SIGHUP"])
-def test_a_signal_to_one_process_stops_both_with_a_checkpoint(
-    runs: pathlib.Path, name: str
-) -> None:
+def test_a_signal_to_one_process_stops_both_with_a_checkpoint(runs, name):
     started = _start_long(runs, name)
     started[1].send_signal(signal.Signals[name])
     outputs = processes.outputs_of(started, timeout_s=120)

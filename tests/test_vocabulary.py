@@ -31,7 +31,7 @@ REPLACED = {
 }
 
 
-def test_replaced_terms_do_not_come_back() -> None:
+def test_replaced_terms_do_not_come_back():
     files = [ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")]
     files += [
         path

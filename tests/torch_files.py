@@ -60,10 +60,8 @@ def write_pth(path: pathlib.Path, tensors: Mapping[str, np.ndarray]) -> None:
     """Write a state dict."""
     body, members = b"\x80\x02}(", {}
     for i, (name, value) in enumerate(tensors.items()):
-        strides = tuple(
-            s // value.itemsize for s in np.ascontiguousarray(value).strides
-        )
-        strides = strides if value.ndim else ()
+        value = np.asarray(value, order="C")
+        strides = tuple(stride // value.itemsize for stride in value.strides)
         storage = STORAGES[value.dtype.name]
         tensor = pickle_tensor(str(i), value.size, value.shape, strides, 0, storage)
         body += pickle_text(name) + tensor

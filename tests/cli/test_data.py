@@ -1,59 +1,44 @@
 """Commands on K-Radar's reduced releases, with two disks and a zip file of labels."""
 
 import json
-import pathlib
 import types
 import zipfile
-from typing import Any
+from unittest import mock
 
 import click.testing
 import numpy as np
 import pytest
 
 from radejax import Detector, KRadar, frame_scene, models
-from radejax.cli import main
 from radejax.core.errors import DataError, UserError
 from radejax.data.kradar.tesseract import read_tesseract
 from radejax.data.records import Records
 from radejax.inference.export import export
 from radejax.inference.saved import SavedModel, save_model
 from radejax.simulation.config import SimulationOptions
-from radejax.simulation.dataset import simulate_dataset
 
 from .. import small_models as small
+from ..commands import run
 
 RELEASES = ("polar3d", "rpc")
 
 
-def _run(*arguments: object, code: int = 0) -> click.testing.Result:
-    arguments = tuple(map(str, arguments))
-    result = click.testing.CliRunner().invoke(main.main, arguments)
-    assert result.exit_code == code, result.output
-    return result
-
-
 @pytest.fixture(scope="module")
-def tensors(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+def tensors(tmp_path_factory):
     """A simulated root with radar tensors."""
     grid = {"num_doppler": 4, "num_range": 24, "num_elevation": 3, "num_azimuth": 16}
-    simulation = SimulationOptions(
-        train_sequences=2, test_sequences=1, frames_per_sequence=4
-    ).replace(grid=grid)
+    sizes = {"train_sequences": 2, "test_sequences": 1, "frames_per_sequence": 4}
     root = tmp_path_factory.mktemp("simulated") / "root"
-    return simulate_dataset(simulation, root, progress=False)
+    return small.simulate(root, **sizes, grid=grid, output="tesseract")
 
 
 @pytest.fixture(scope="module", params=RELEASES)
-def disks(
-    request: pytest.FixtureRequest,
-    tensors: pathlib.Path,
-    tmp_path_factory: pytest.TempPathFactory,
-) -> Any:
+def disks(request, tensors, tmp_path_factory):
     """Two disks, one with radar frames only, and a zip file of the labels."""
     folder = tmp_path_factory.mktemp(request.param)
     others, radar = folder / "others", folder / "radar"
     options = ("--to", request.param, "--rate", 0.1, "--out", others)
-    assert "12 preprocessed" in _run("reduce", tensors, *options).output
+    assert "12 preprocessed" in run("reduce", tensors, *options).output
     for path in others.glob(f"*/{request.param}_*.npy"):
         target = radar / path.parent.name / path.name
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -66,7 +51,7 @@ def disks(
     return request.param, (radar, others), labels
 
 
-def _model(doppler_bins: int, root: pathlib.Path, release: str | None) -> SavedModel:
+def _model(doppler_bins, root, release):
     """An untrained radar-only model for the simulated radar."""
     config = small.radar_config().replace(
         data={"release": release}, model={"doppler_bins": doppler_bins}
@@ -78,24 +63,22 @@ def _model(doppler_bins: int, root: pathlib.Path, release: str | None) -> SavedM
     return SavedModel(config, grid, small.drawn(model, inputs))
 
 
-def test_frames_are_checked_preprocessed_and_drawn(
-    disks: Any, tmp_path: pathlib.Path
-) -> None:
+def test_frames_are_checked_preprocessed_and_drawn(disks, tmp_path):
     release, roots, labels = disks
     words = (*roots, "--labels", labels)
-    report = json.loads(_run("data", "check", *words, "--deep", "--json").output)
+    report = json.loads(run("data", "check", *words, "--deep", "--json").output)
     assert report["summary"]["num_problems"] == 0
     assert [row["projections"] for row in report["sequences"]] == [4, 4, 4]
     records = tmp_path / "records"
     for shard, count in (("0/2", 6), ("0/1", 6)):
-        text = _run("preprocess", *words, "--out", records, "--shard", shard).output
+        text = run("preprocess", *words, "--out", records, "--shard", shard).output
         assert f"{count} preprocessed, 0 skipped" in text
     opened = Records.open(records)
     assert (len(opened.keys()), opened.source["release"]) == (12, release)
     assert opened.shape == (24, 16, 4 + 3)
     data = ("--data", ",".join(map(str, roots)), "--labels", labels)
     out = tmp_path / "a.png"
-    _run("overlay", min(opened.keys()), *data, "--slices", "--out", out)
+    run("overlay", min(opened.keys()), *data, "--slices", "--out", out)
     assert out.stat().st_size > 10_000
     frames = KRadar(roots, labels, visibility=None)
     projection = frames[0].read_projection(frames.grid)
@@ -104,26 +87,22 @@ def test_frames_are_checked_preprocessed_and_drawn(
 
 
 def test_the_full_size_keeps_the_radar_of_the_config(tmp_path, monkeypatch):
-    made = []
-    monkeypatch.setattr(
-        "radejax.simulate", lambda options, *_, **__: made.append(options)
-    )
+    simulate = mock.Mock()
+    monkeypatch.setattr("radejax.simulate", simulate)
     radar = {"preset": "ideal", "noise_db": 100.0, "azimuth_elements": 5.0}
     config = types.SimpleNamespace(simulation=SimulationOptions(radar=radar))
     monkeypatch.setattr("radejax.load_config", lambda _: config)
-    _run("simulate", "--config", "own", "--full-size", "--out", tmp_path / "out")
-    (options,) = made
+    run("simulate", "--config", "own", "--full-size", "--out", tmp_path / "out")
+    options = simulate.call_args.args[0]
     assert dict(options.radar) == {"preset": "ideal", "noise_db": 100.0}
 
 
-def test_boxes_are_found_in_files_and_arrays(
-    disks: Any, tensors: pathlib.Path, tmp_path: pathlib.Path
-) -> None:
+def test_boxes_are_found_in_files_and_arrays(disks, tensors, tmp_path):
     release, roots, _ = disks
     saved = _model({"polar3d": 4, "rpc": 0}[release], tensors, release)
     save_model(saved, tmp_path / "model")
     words = ("--workdir", tmp_path / "model", "--out", tmp_path / "boxes")
-    text = _run("detect", roots[0], *words, "--batch-size", 4).output
+    text = run("detect", roots[0], *words, "--batch-size", 4).output
     assert "in 12 frames" in text
     paths = sorted(roots[0].glob(f"1/{release}_*.npy"))
     names = {f"1_{path.stem.partition('_')[2]}.json" for path in paths}
@@ -144,9 +123,7 @@ def test_boxes_are_found_in_files_and_arrays(
 
 
 @pytest.mark.parametrize("release", [None, "polar3d", "rpc"])
-def test_a_detector_takes_the_form_that_it_was_trained_on(
-    disks: Any, tensors: pathlib.Path, release: str | None
-) -> None:
+def test_a_detector_takes_the_form_that_it_was_trained_on(disks, tensors, release):
     found, roots, _ = disks
     detector = Detector(_model(4, tensors, release), batch_sizes=(1,))
     path = next(roots[0].glob(f"1/{found}_*.npy"))
@@ -159,20 +136,18 @@ def test_a_detector_takes_the_form_that_it_was_trained_on(
                 detector(frame)
 
 
-def test_points_of_two_disks(
-    disks: Any, tensors: pathlib.Path, tmp_path: pathlib.Path
-) -> None:
+def test_points_of_two_disks(disks, tensors, tmp_path):
     release, (radar, others), _ = disks
     (radar / "9").mkdir(exist_ok=True)
     (radar / "9" / f"{release}_00001.npy").write_bytes(b"no array")
     words = ("--rate", 0.1, "--out", tmp_path / "found")
-    text = _run("points", radar, others, *words, code=1).output
+    text = run("points", radar, others, *words, code=1).output
     (radar / "9" / f"{release}_00001.npy").unlink()
     (radar / "9").rmdir()
     assert "12 preprocessed, 1 skipped" in text
     assert f"skipped {radar / '9' / release}_00001.npy: " in text
     expected = tmp_path / "expected"
-    _run("points", tensors, "--rate", 0.1, "--out", expected)
+    run("points", tensors, "--rate", 0.1, "--out", expected)
     paths = sorted(expected.glob("*/rpc_*.npy"))
     assert len(paths) == 12
     grid = KRadar(tensors).grid
@@ -184,16 +159,14 @@ def test_points_of_two_disks(
         elevation_rad = grid.elevation_rad[found[:, 10].astype(int)]
         np.testing.assert_allclose(found[:, 2], found[:, 5] * np.sin(elevation_rad))
     words = ("--to", "pcd", "--method", "cfar", "--threshold-db", 3)
-    _run("points", radar, others, *words, "--sequences", 1, "--out", tmp_path / "c")
+    run("points", radar, others, *words, "--sequences", 1, "--out", tmp_path / "c")
     assert len(list((tmp_path / "c").glob("1/rpc_*.pcd"))) == 4
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("commands_on_one_device")
 @pytest.mark.parametrize("doppler_bins", [4, 0])
-def test_a_run_is_trained_evaluated_and_detects(
-    disks: Any, tmp_path: pathlib.Path, doppler_bins: int
-) -> None:
+def test_a_run_is_trained_evaluated_and_detects(disks, tmp_path, doppler_bins):
     from radejax.cli.train import train
 
     release, roots, labels = disks
@@ -211,6 +184,6 @@ def test_a_run_is_trained_evaluated_and_detects(
     assert result.exit_code == 0, result.output
     assert Records.open(tmp_path / "records").shape == (24, 16, doppler_bins + 3)
     assert (tmp_path / "run/evaluation/metrics.json").is_file()
-    _run("evaluate", tmp_path / "run", "--split", "train")
+    run("evaluate", tmp_path / "run", "--split", "train")
     words = ["--workdir", str(tmp_path / "run"), "--out", str(tmp_path / "boxes")]
-    assert "in 12 frames" in _run("detect", roots[0], *words).output
+    assert "in 12 frames" in run("detect", roots[0], *words).output

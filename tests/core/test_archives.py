@@ -4,16 +4,11 @@ import zipfile
 import numpy as np
 import pytest
 
-from radejax.core.archives import (
-    read_member,
-    read_npy,
-    read_npz,
-    read_safetensors,
-)
+from radejax.core.archives import read_member, read_npy, read_npz, read_safetensors
 from radejax.core.errors import DataError
 
 
-def npy(array: np.ndarray) -> bytes:
+def npy(array):
     file = io.BytesIO()
     np.save(file, array)
     return file.getvalue()
@@ -45,11 +40,8 @@ def test_a_shape_that_is_not_the_files_is_named(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
         archive.writestr("first.npy", content)
     (tmp_path / "b.npy").write_bytes(npy(np.zeros(4)) + b"more")
-    for reader, name in (
-        (read_npy, "a.npy"),
-        (read_npy, "b.npy"),
-        (read_npz, "a.npz"),
-    ):
+    readers = {"a.npy": read_npy, "b.npy": read_npy, "a.npz": read_npz}
+    for name, reader in readers.items():
         with pytest.raises(DataError, match=f"{name}: corrupted"):
             reader(tmp_path / name)
 
@@ -57,11 +49,7 @@ def test_a_shape_that_is_not_the_files_is_named(tmp_path):
 @pytest.mark.parametrize("reader", [read_npy, read_npz])
 def test_every_truncation_and_flip_is_read_or_named(tmp_path, reader):
     path = tmp_path / f"a.{reader.__name__[-3:]}"
-    array = np.arange(6.0)
-    if reader is read_npy:
-        path.write_bytes(npy(array))
-    else:
-        np.savez_compressed(path, a=array)
+    {read_npy: np.save, read_npz: np.savez_compressed}[reader](path, np.arange(6.0))
     content = path.read_bytes()
     num_named = 0
     for place in range(len(content)):
@@ -93,8 +81,6 @@ def test_members_that_are_not_read(tmp_path):
 
 def test_a_pointer_in_place_of_weights(tmp_path):
     path = tmp_path / "model.safetensors"
-    path.write_text(
-        "version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n"
-    )
+    path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\n")
     with pytest.raises(DataError, match=r"model\.safetensors: a pointer of Git LFS"):
         read_safetensors(path)

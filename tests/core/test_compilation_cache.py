@@ -14,7 +14,7 @@ from radejax.core import compilation_cache
 @pytest.fixture
 def values(monkeypatch):
     """Settings of JAX, of which the cache is not set."""
-    found: dict[str, object] = {"jax_compilation_cache_dir": None}
+    found = {"jax_compilation_cache_dir": None}
     config = SimpleNamespace(values=found, update=found.__setitem__)
     monkeypatch.setattr(jax, "config", config)
     return found
@@ -66,12 +66,6 @@ def test_files_of_a_killed_process_do_not_stop_the_cache(tmp_path):
     (folder / "orphan-atime").write_bytes(b"")
     environment = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
-    done = subprocess.run(
-        [sys.executable, "-c", _PROGRAM],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert done.stderr == ""
+    options = {"env": environment, "capture_output": True, "check": True}
+    assert subprocess.run([sys.executable, "-c", _PROGRAM], **options).stderr == b""
     assert len(list(folder.iterdir())) > 2

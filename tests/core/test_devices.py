@@ -60,12 +60,9 @@ def test_a_process_that_fails_ends_the_other(tmp_path):
     outputs = processes.outputs_of(started, timeout_s=60)
     assert [process.returncode for process in started] == [1, 1]
     assert "OSError no data" in outputs[0].splitlines()
-    message = "UserError process 0 stopped with an error, see its output"
-    assert message in outputs[1].splitlines()
-    line = processes.lost(1).replace(
-        "was lost", "stopped with an error, see its output"
-    )
-    assert line in outputs[0].splitlines()
+    reason = "stopped with an error, see its output"
+    assert f"UserError process 0 {reason}" in outputs[1].splitlines()
+    assert processes.lost(1).replace("was lost", reason) in outputs[0].splitlines()
     assert "Traceback" not in outputs[0]
     assert outputs[1].splitlines()[-1] == "OSError: a defect"
 
@@ -84,9 +81,7 @@ def test_signals_ask_to_stop(stop, name):
     assert stop()
 
 
-def test_the_second_signal_of_a_closed_terminal_is_ignored_and_that_of_a_user_is_not(
-    stop,
-):
+def test_only_the_second_signal_of_a_closed_terminal_is_ignored(stop):
     # The shell and the kernel both send SIGHUP when a terminal is closed.
     for number in (signal.SIGHUP, signal.SIGHUP, signal.SIGUSR1):
         os.kill(os.getpid(), number)

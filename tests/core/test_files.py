@@ -79,11 +79,9 @@ def test_a_folder_is_one_jobs(tmp_path):
     changed = {**plan, "watch": 2, "a": {**plan["a"], "b": 3}}
     files.claim(path, changed, "another job", ignore=("watch", "a.b"))
     other = {"a": {"b": (1, 3), "long": []}, "watch": 1}
-    with pytest.raises(
-        UserError,
-        match=r"new holds another job: a\.b is \[1, 2\] there and \[1, 3\] here; "
-        r"a\.long differs; seed is 0 there and None here; give --out",
-    ):
+    text = r"new holds another job: a\.b is \[1, 2\] there and \[1, 3\] here; "
+    text += r"a\.long differs; seed is 0 there and None here; give --out"
+    with pytest.raises(UserError, match=text):
         files.claim(path, other, "another job", fix="give --out")
 
 

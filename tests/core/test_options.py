@@ -1,7 +1,7 @@
 """Options: changes of them, messages of wrong values, and the parts that they name."""
 
 import pathlib
-from typing import Any, Literal
+from typing import Literal
 
 import pytest
 
@@ -122,11 +122,11 @@ CLASSES = ("Sedan", "Bus or Truck", "Bicycle")
         ({}, 0.3),
     ],
 )
-def test_score_thresholds_of_classes(given: Any, expected: Any) -> None:
+def test_score_thresholds_of_classes(given, expected):
     assert class_thresholds(given, CLASSES, 0.3) == expected
 
 
-def test_unnamed_classes_keep_their_own_threshold() -> None:
+def test_unnamed_classes_keep_their_own_threshold():
     assert class_thresholds("Sedan=1", CLASSES, (0.1, 0.2, 0.3)) == (1.0, 0.2, 0.3)
 
 
@@ -138,7 +138,7 @@ def test_unnamed_classes_keep_their_own_threshold() -> None:
         *("Sedan=0.4,Sedan=0.5", "Sedan=0.4,,", "0.3,0.4", "nan", "Sedan=nan"),
     ],
 )
-def test_wrong_score_thresholds_are_one_clear_line(given: Any) -> None:
+def test_wrong_score_thresholds_are_one_clear_line(given):
     with pytest.raises(UserError) as caught:
         class_thresholds(given, CLASSES, 0.3)
     assert str(caught.value) == (

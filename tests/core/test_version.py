@@ -8,7 +8,7 @@ from radejax.core import version
 def test_the_commit_of_a_clone_tells_of_changes(tmp_path, monkeypatch):
     assert version.commit(tmp_path) == "not in a repository"
 
-    def git(*words: str) -> str:
+    def git(*words):
         user = ["-c", "user.name=a", "-c", "user.email=a@b.c"]
         command = ["git", "-C", str(tmp_path), *user, *words]
         done = subprocess.run(command, capture_output=True, text=True, check=True)

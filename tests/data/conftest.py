@@ -34,9 +34,8 @@ def write_kradar(
     splits = {"train": [], "test": []}
     for sequence in sequences:
         folder = root / str(sequence)
-        write.write_calibration(
-            folder / "info_calib/calib_radar_lidar.txt", 3, -2.5, 0.25
-        )
+        path = folder / "info_calib/calib_radar_lidar.txt"
+        write.write_calibration(path, 3, -2.5, 0.25)
         write.write_description(folder / "description.txt", "urban", "day", "fog")
         for lidar in range(1, num_frames + 1):
             name = f"{lidar + 3:05d}_{lidar:05d}"

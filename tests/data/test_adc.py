@@ -1,6 +1,5 @@
 """From ADC samples to power: signs, sizes, aliasing, files and wrong input."""
 
-import pathlib
 import re
 
 import jax
@@ -83,13 +82,9 @@ def test_a_point_is_at_its_place_with_the_power_of_the_windows(
     """Right azimuth and receding velocity are positive, and TDM does not shift the angle."""
     radar = RADAR.replace(is_complex=is_complex)
     grid = radar.make_grid()
-    where = (
-        grid.range_m[range_],
-        grid.doppler_mps[doppler],
-        grid.azimuth_rad[azimuth],
-        grid.elevation_rad[elevation],
-    )
-    power = power_of(radar, echo(radar, *where))
+    angles = grid.azimuth_rad[azimuth], grid.elevation_rad[elevation]
+    samples = echo(radar, grid.range_m[range_], grid.doppler_mps[doppler], *angles)
+    power = power_of(radar, samples)
     assert power.shape == grid.shape_drea
     assert peak(power) == (doppler, range_, elevation, azimuth)
     gains = [window.sum() ** 2 for window in radar.windows()]
@@ -107,12 +102,13 @@ def test_velocities_alias_and_real_samples_mirror_nothing():
     """A target of twice the axis's end is 0 m/s; the angle's compensation is then wrong."""
     around = 2 * -GRID.doppler_mps[0]
     radar = RADAR.replace(tx_m=RADAR.tx_m[:1])  # of three times the axis
-    still, fast = (
-        power_of(radar, echo(radar, GRID.range_m[20], v)) for v in (0.0, 3 * around)
-    )
-    assert peak(still) == peak(fast)
-    assert peak(power_of(RADAR, echo(RADAR, GRID.range_m[20], around)))[0] == 8
-    assert peak(power_of(RADAR, echo(RADAR, GRID.range_m[20], around)))[3] != 6
+
+    def peak_of(radar, velocity_mps):
+        return peak(power_of(radar, echo(radar, GRID.range_m[20], velocity_mps)))
+
+    assert peak_of(radar, 0.0) == peak_of(radar, 3 * around)
+    assert peak_of(RADAR, around)[0] == 8
+    assert peak_of(RADAR, around)[3] != 6
 
 
 def test_sidelobes_in_range_and_doppler_are_those_of_a_hann_window():
@@ -154,11 +150,8 @@ def test_frames_can_be_batched():
 @pytest.mark.parametrize("is_interleaved", [True, False])
 @pytest.mark.parametrize("is_complex", [True, False])
 def test_files_of_all_layouts_are_read(
-    is_complex: bool,
-    is_interleaved: bool,
-    is_offset_binary: bool,
-    tmp_path: pathlib.Path,
-) -> None:
+    is_complex, is_interleaved, is_offset_binary, tmp_path
+):
     """Written word by word as TI's document lists them."""
     radar = RADAR.replace(num_chirps=2, num_samples=4, is_complex=is_complex)
     shape = (3, *radar.shape, 2 if is_complex else 1)
@@ -166,17 +159,12 @@ def test_files_of_all_layouts_are_read(
     words = []
     for chirp in counts.reshape(-1, 4, *shape[-2:]):  # [Q, N, parts]
         if is_interleaved:
-            words += [
-                chirp[q, n, p]
-                for n in range(4)
-                for p in range(shape[-1])
-                for q in range(4)
-            ]
+            words += chirp.transpose(1, 2, 0).ravel().tolist()
         elif is_complex:
             for q, n in ((q, n) for q in range(4) for n in (0, 2)):
                 words += [*chirp[q, n : n + 2, 0], *chirp[q, n : n + 2, 1]]
         else:
-            words += [chirp[q, n, 0] for q in range(4) for n in range(4)]
+            words += chirp.ravel().tolist()
     path = tmp_path / "adc_data.bin"
     kind = "<u2" if is_offset_binary else "<i2"
     (np.array(words) + 2**15 * is_offset_binary).astype(kind).tofile(path)
@@ -186,40 +174,22 @@ def test_files_of_all_layouts_are_read(
         found = read_ti_bin(path, frame, radar, **layout)
         assert found.dtype == (np.complex64 if is_complex else np.float32)
         np.testing.assert_array_equal(found, expected)
-    with pytest.raises(
-        DataError, match=r"adc_data.bin has 3 frames of .* above 3: check"
-    ):
+    with pytest.raises(DataError, match=r"adc_data.bin has 3 frames of .* above 3:"):
         read_ti_bin(path, 3, radar, **layout)
+    longer = radar.replace(num_samples=6, rx_m=RADAR.rx_m[:3])
     with pytest.raises(DataError, match=r"adc_data.bin has 2.66667 frames"):
-        read_ti_bin(
-            path, 0, radar.replace(num_samples=6, rx_m=RADAR.rx_m[:3]), **layout
-        )
+        read_ti_bin(path, 0, longer, **layout)
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (
-            {"rx_m": np.array([[0, 0.5 * i, 0] for i in range(4)])},
-            "radar.rx_m is in meters; its spacing is 0.5, expected less than 20 wavelengths",
-        ),
+        ({"rx_m": [(0, 0, 0), (0, 0.5, 0)]}, "rx_m is in meters; its spacing is 0.5,"),
         ({"rx_m": [(0.0, 0.0)]}, r"radar.rx_m\[0\] is missing"),
-        (
-            {"azimuth_rad": np.arange(-50.0, 51.0)},
-            "azimuth_rad must be finite, to 3.14159 radians .* got values from -50 to 50",
-        ),
-        (
-            {"carrier_hz": 77.0},
-            "radar.carrier_hz is 77.0, expected a number of at least 1000000000",
-        ),
-        (
-            {"slope_hz_per_s": 30.0},
-            "radar.slope_hz_per_s is 30.0, expected Hz per second .30 MHz/us are 30e12",
-        ),
-        (
-            {"sample_rate_hz": 10_000.0},
-            "radar.sample_rate_hz is 10000.0, expected at least 3.2e",
-        ),
+        ({"azimuth_rad": np.arange(-50.0, 51.0)}, "3.14159 radians .* from -50 to 50"),
+        ({"carrier_hz": 77.0}, "carrier_hz is 77.0, expected a number of at least"),
+        ({"slope_hz_per_s": 30.0}, "is 30.0, expected Hz per second .30 MHz/us are"),
+        ({"sample_rate_hz": 10_000.0}, "_rate_hz is 10000.0, expected at least 3.2e"),
     ],
 )
 def test_wrong_radars_are_named(change, message):
@@ -229,28 +199,20 @@ def test_wrong_radars_are_named(change, message):
 
 
 @pytest.mark.parametrize(
-    ("samples", "message"),
+    ("num_tx", "dtype", "message"),
     [
-        (
-            np.zeros((16, 2, 4, 64), complex),
-            "shape of samples is (16, 2, 4, 64), expected (16, 3, 4, 64): num_chirps",
-        ),
-        (
-            np.zeros((16, 3, 4, 64), np.int16),
-            "type of samples is 'int16', expected complex, as radar.is_complex",
-        ),
+        (2, complex, r"samples is \(16, 2, 4, 64\), expected \(16, 3, 4, 64\):"),
+        (3, np.int16, "type of samples is 'int16', expected complex"),
     ],
 )
-def test_samples_of_other_radars_are_named(samples, message):
-    with pytest.raises(UserError, match=re.escape(message)) as error:
-        adc_to_power(samples, RADAR)
+def test_samples_of_other_radars_are_named(num_tx, dtype, message):
+    with pytest.raises(UserError, match=message) as error:
+        adc_to_power(np.zeros((16, num_tx, 4, 64), dtype), RADAR)
     assert not getattr(error.value, "__notes__", None)  # as JAX adds them inside of jit
     assert error.value.__cause__ is None
 
 
-COUNTS = (
-    np.random.default_rng(0).integers(-300, 300, (2, *RADAR.shape)).astype(np.int16)
-)
+COUNTS = np.random.default_rng(0).integers(-300, 300, (2, *RADAR.shape), np.int16)
 SAMPLES = COUNTS[0] + 1j * COUNTS[1]
 WRAPPED = COUNTS.view(np.uint16)  # two's complement
 REAL = RADAR.replace(is_complex=False)

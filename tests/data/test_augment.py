@@ -7,13 +7,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from radejax.core.errors import UserError
-from radejax.data.augment import (
-    Augmentation,
-    Sample,
-    change_gain,
-    mirror,
-    mirror_camera,
-)
+from radejax.data import augment as augmentation
+from radejax.data.augment import Augmentation, Sample, mirror
 from radejax.data.cameras import read_left_image
 from radejax.data.projection import LOG_SCALE_DB, decode, encode
 from radejax.geometry.camera import CameraCalibration, project
@@ -51,6 +46,7 @@ box = st.tuples(
     st.floats(-1, 1),
     st.floats(-1, 1),
 )
+point = st.tuples(st.floats(5, 80), st.floats(-30, 30), st.floats(-2, 4))
 boxes_st = st.lists(box, min_size=1, max_size=4).map(lambda b: np.array(b, np.float64))
 
 
@@ -63,9 +59,8 @@ def test_mirrored_boxes_and_maps_stay_in_register(boxes, seed):
         (r, a), (r2, a2) = GRID.nearest_bin(*old[:2]), GRID.nearest_bin(*new[:2])
         assert r == r2
         assert abs((GRID.num_azimuth - 1 - a) - a2) <= 1  # halves round to even
-        np.testing.assert_array_equal(
-            after.projection[r, GRID.num_azimuth - 1 - a], before.projection[r, a]
-        )
+        found = after.projection[r, GRID.num_azimuth - 1 - a]
+        np.testing.assert_array_equal(found, before.projection[r, a])
         # Heading (cos, sin) mirrors with the position.
         np.testing.assert_array_equal(new[[7, 6]], old[[7, 6]] * (1, -1))
         np.testing.assert_array_equal(new[[0, 2, 3, 4, 5]], old[[0, 2, 3, 4, 5]])
@@ -76,18 +71,15 @@ def test_mirrored_boxes_and_maps_stay_in_register(boxes, seed):
 
 @settings(deadline=None, max_examples=30)
 @given(
-    points=st.lists(
-        st.tuples(st.floats(5, 80), st.floats(-30, 30), st.floats(-2, 4)),
-        min_size=1,
-        max_size=5,
-    ),
+    points=st.lists(point, min_size=1, max_size=5),
     kind=st.sampled_from(["raw", "pinhole"]),
 )
 def test_mirrored_camera_sees_the_mirrored_world_in_the_mirrored_image(points, kind):
     points = np.array(points)
     camera = CAMERA.camera(kind)
     before, depth = project(points, camera)
-    after, depth_after = project(points * (1, -1, 1), mirror_camera(camera))
+    mirrored = augmentation.mirror_camera(camera)
+    after, depth_after = project(points * (1, -1, 1), mirrored)
     np.testing.assert_allclose(depth_after, depth, rtol=1e-12)
     np.testing.assert_allclose(after[:, 1], before[:, 1], rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(after[:, 0], 1280 - before[:, 0], rtol=1e-9, atol=1e-9)
@@ -106,22 +98,18 @@ def test_image_is_mirrored_with_its_camera():
 
 def test_a_point_has_its_color_in_the_resized_and_the_mirrored_image(tmp_path):
     """Read as the model samples: pixel i has its center at i + 1/2."""
-    ramp = np.broadcast_to(
-        2 * np.arange(128, dtype=np.uint8)[None, :, None], (64, 128, 3)
-    )
+    ramp = np.full((64, 128, 3), 2 * np.arange(128)[:, None], np.uint8)
     Image.fromarray(ramp).save(tmp_path / "a.png")
-    calibration = dataclasses.replace(
-        CAMERA, intrinsics=(60.0, 60.0, 55.0, 30.0), width=128, height=64
-    )
+    fields = {"intrinsics": (60.0, 60.0, 55.0, 30.0), "width": 128, "height": 64}
+    calibration = dataclasses.replace(CAMERA, **fields)
     points = np.array([[20.0, 3.0, 0.0], [30.0, -8.5, 0.0], [15.0, 2.25, 1.0]])
     colors = []
     for scale in (1, 2):
         width, height = 128 // scale, 64 // scale
         image = read_left_image(tmp_path / "a.png", (height, width), resize=True)
         camera = calibration.resized(width, height).camera()
-        before = dataclasses.replace(
-            sample(np.zeros((1, 8))), image=image, camera=camera
-        )
+        before = sample(np.zeros((1, 8)))
+        before = dataclasses.replace(before, image=image, camera=camera)
         for frame, sign in ((before, 1), (mirror(before), -1)):
             (pixels, _) = project(points * (1, sign, 1), frame.camera)
             row = frame.image[0, :, 0].astype(float)
@@ -168,17 +156,12 @@ def test_uneven_azimuths_are_mirrored_if_they_are_symmetric(sign):
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.uint8])
 def test_gain_shifts_all_levels_by_the_same_decibels(dtype):
     before = sample(np.zeros((0, 8)), dtype)
-    after = change_gain(before, 18.43)  # a tenth of the scale
+    after = augmentation.change_gain(before, 18.43)  # a tenth of the scale
     assert after.projection.dtype == dtype
     shift = decode(after.projection) - decode(before.projection)
     np.testing.assert_allclose(shift, 0.1, atol=0.002)
     augment = Augmentation(GRID, random_gain_db=6.0)
     rng = np.random.default_rng(0)
-    shifts_db = [
-        float(
-            np.mean(decode(augment(before, rng).projection) - decode(before.projection))
-        )
-        * LOG_SCALE_DB
-        for _ in range(40)
-    ]
+    changed = [decode(augment(before, rng).projection).mean() for _ in range(40)]
+    shifts_db = (np.array(changed) - decode(before.projection).mean()) * LOG_SCALE_DB
     assert -6.3 < min(shifts_db) < -3.0 < 3.0 < max(shifts_db) < 6.3

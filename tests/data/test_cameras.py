@@ -7,14 +7,9 @@ import pytest
 from PIL import Image
 
 from radejax.core.errors import DataError, UserError
-from radejax.data.cameras import (
-    IMAGE_SIZE,
-    CameraOptions,
-    camera_inputs,
-    front_view,
-    read_left_image,
-)
+from radejax.data.cameras import IMAGE_SIZE, camera_inputs, front_view, read_left_image
 from radejax.data.kradar import Frame
+from radejax.data.options import CameraOptions
 from radejax.geometry.camera import CameraCalibration, project
 from radejax.simulation.camera.renderer import stereo_calibration
 from radejax.simulation.config import FULL_SIZE, SimulationOptions
@@ -59,13 +54,8 @@ def test_cameras_project_as_their_calibration(frames):
     frames[1].radar_from_lidar_z_m = 3.0
     cameras = frame_cameras(frames, (32, 64))
     for frame, camera in zip(frames, cameras, strict=True):
-        wanted = dataclasses.replace(
-            CALIBRATION,
-            radar_from_lidar_m=(
-                *frame.radar_from_lidar_m[:2],
-                frame.radar_from_lidar_z_m,
-            ),
-        ).camera()
+        shift = (*frame.radar_from_lidar_m[:2], frame.radar_from_lidar_z_m)
+        wanted = dataclasses.replace(CALIBRATION, radar_from_lidar_m=shift).camera()
         np.testing.assert_allclose(camera.cam_from_ego, wanted.cam_from_ego)
         np.testing.assert_allclose(camera.distortion, wanted.distortion)
         assert camera.is_valid
@@ -77,9 +67,7 @@ def test_a_calibration_for_images_of_twice_the_size_is_named(frames, monkeypatch
     """By any reader, before its image is read."""
     double = dataclasses.replace(CALIBRATION, width=128, height=64)
     monkeypatch.setattr(_Frame, "read_calibration", lambda frame, shift=None: double)
-    message = (
-        r"cam_front0\.yml: principal point 32, 16 in an image of 128 x 64 pixels, "
-    )
+    message = r"cam_front0\.yml: principal point 32, 16 in an image of 128 x 64 pix"
     with pytest.raises(DataError, match=message):
         front_view(frames[0])
     with pytest.raises(DataError, match=message):
@@ -125,9 +113,8 @@ def test_missing_ones_are_an_error_or_counted(frames, field, caplog):
 
 def test_left_half_of_the_stereo_pair(tmp_path):
     height, width = IMAGE_SIZE
-    pixels = np.random.default_rng(0).integers(
-        0, 255, (height, 2 * width, 3), dtype=np.uint8
-    )
+    rng = np.random.default_rng(0)
+    pixels = rng.integers(0, 255, (height, 2 * width, 3), np.uint8)
     path = tmp_path / "a.png"
     for shown in (pixels[:, :width], pixels):
         Image.fromarray(shown).save(path, compress_level=1)
@@ -153,9 +140,7 @@ def test_a_calibration_of_images_of_another_shape_is_named(tmp_path):
         Image.new("RGB", (width, 72)).save(path)
         assert read_left_image(path, (18, 32), **sizes).shape == (18, 32, 3)
     Image.new("RGB", (96, 72)).save(path)
-    with pytest.raises(
-        DataError, match=r"a\.png: 96 x 72 pixels, .* is for 64 x 36, of another aspect"
-    ):
+    with pytest.raises(DataError, match=r"96 x 72 pixels, .* is for 64 x 36, of"):
         read_left_image(path, (18, 32), **sizes)
 
 

@@ -10,15 +10,12 @@ from PIL import Image
 
 from radejax.core.errors import UserError
 from radejax.core.structures import CLASSES, Batch
+from radejax.data import pipeline
 from radejax.data.augment import Augmentation
 from radejax.data.cameras import CameraOptions, camera_inputs
 from radejax.data.kradar import KRadar
-from radejax.data.pipeline import (
-    LoaderOptions,
-    frame_histories,
-    make_loader,
-    make_table,
-)
+from radejax.data.pipeline import LoaderOptions, make_loader, make_table
+from radejax.data.projection import stack_frames
 from radejax.data.records import Records, open_projections, preprocess
 
 from .. import small_models as small
@@ -43,9 +40,8 @@ def loader(records, data):
     table = make_table(records, data, max_objects=5)
 
     def make(augment=None, **options):
-        return make_loader(
-            table, dataclasses.replace(OPTIONS, **options), augment=augment
-        )
+        options = dataclasses.replace(OPTIONS, **options)
+        return make_loader(table, options, augment=augment)
 
     return make
 
@@ -75,9 +71,8 @@ def test_batches_are_the_records_and_labels(loader, records, data):
             yaw = np.arctan2(found[:, 6], found[:, 7])
             wanted = np.arctan2(np.sin(frame.boxes[:, 6]), np.cos(frame.boxes[:, 6]))
             np.testing.assert_allclose(yaw, wanted, atol=1e-6)
-            assert [CLASSES[i] for i in batch.classes[row, :count]] == list(
-                frame.classes
-            )
+            classes = [CLASSES[i] for i in batch.classes[row, :count]]
+            assert classes == frame.classes.tolist()
             assert not batch.boxes[row, count:].any()
             assert (batch.classes[row, count:] == -1).all()
     assert batch.image is None
@@ -109,10 +104,8 @@ def test_order_depends_only_on_the_seed(loader):
 
 def frames_of_processes(loader, count, **options):
     """Frames of the batches of every process."""
-    return [
-        frames_of(loader(process_index=i, process_count=count, **options))
-        for i in range(count)
-    ]
+    make = functools.partial(loader, process_count=count, **options)
+    return [frames_of(make(process_index=i)) for i in range(count)]
 
 
 def test_batches_do_not_depend_on_the_number_of_processes(loader):
@@ -155,22 +148,20 @@ def test_preceding_frames_by_hand():
     keys = ["1/00001_00004", "1/00002_00005", "1/00004_00007", "2/00003_00001"]
     keys += ["10/00002_00001", "1/00003b"]
     a, b, d, other, ten, c = keys
-    pairs = frame_histories(reversed(keys), 2)
-    assert pairs == {
-        **{a: (a, a), b: (a, b), c: (b, c), d: (c, d)},
-        **{other: (other, other), ten: (ten, ten)},
-    }
+    pairs = pipeline.frame_histories(reversed(keys), 2)
+    of_one = {other: (other, other), ten: (ten, ten)}
+    assert pairs == of_one | {a: (a, a), b: (a, b), c: (b, c), d: (c, d)}
     # A history ends where a frame is missing.
-    three = frame_histories([a, b, d, "1/00005_00008"], 3)
+    three = pipeline.frame_histories([a, b, d, "1/00005_00008"], 3)
     assert three[b] == (a, a, b)
     assert three[d] == (d, d, d)
     assert three["1/00005_00008"] == (d, d, "1/00005_00008")
     # Two names of one radar frame, as two label revisions may give it.
-    twice = frame_histories([a, b, "1/00002_00006"], 2)
+    twice = pipeline.frame_histories([a, b, "1/00002_00006"], 2)
     assert twice[b] == (a, b)
     assert twice["1/00002_00006"] == (a, "1/00002_00006")
     with pytest.raises(UserError, match=r"frame 1/x7: .*num_frames=2 needs names that"):
-        frame_histories(["1/x7"], 2)
+        pipeline.frame_histories(["1/x7"], 2)
 
 
 @pytest.mark.parametrize("probability", [0.0, 1.0])
@@ -202,9 +193,7 @@ def test_samples_are_the_records_of_a_frame_and_the_preceding_ones(
                 before = frame
             repeated += before is frame or position == 0
             pair = [records[before.key], records[frame.key]]
-            channels = np.concatenate(
-                [x[..., :doppler] for x in pair] + [x[..., doppler:] for x in pair], -1
-            )
+            channels = stack_frames(pair, doppler)
             wanted = channels[:, ::-1] if probability else channels
             np.testing.assert_array_equal(sample, wanted)
     assert seen == len(test) < len(every)
@@ -251,9 +240,8 @@ def test_augmentation_changes_per_epoch_and_stays_in_register(loader, data, reco
             mirrored[int(index)].add(is_mirrored)
             count = len(data[index].boxes)
             sign = -1 if is_mirrored else 1
-            np.testing.assert_allclose(
-                batch.boxes[row, :count, 1], sign * data[index].boxes[:, 1], rtol=1e-6
-            )
+            y_m, expected = batch.boxes[row, :count, 1], sign * data[index].boxes[:, 1]
+            np.testing.assert_allclose(y_m, expected, rtol=1e-6)
     assert sum(len(seen) == 2 for seen in mirrored.values()) >= 9
 
 
@@ -264,9 +252,10 @@ def test_images_and_cameras(records, data, tmp_path):
     calibration = small.calibration(intrinsics=(2, 2, 2, 1), width=4, height=2)
     (tmp_path / "cam_1.yml").write_text(calibration.to_kradar_text())
     fields = {"camera_calibration_path": tmp_path / "cam_1.yml"}
+    shown = [*paths[:2], None, *paths[3:]]
     frames = [
-        dataclasses.replace(frame, camera_path=None if i == 2 else paths[i], **fields)
-        for i, frame in enumerate(data)
+        dataclasses.replace(frame, camera_path=path, **fields)
+        for frame, path in zip(data, shown, strict=True)
     ]
     images = camera_inputs(frames, (2, 4), CameraOptions())
     table = make_table(records, frames, max_objects=5, images=images)
@@ -311,11 +300,8 @@ def written(tmp_path):
 
 @pytest.mark.wrong_types
 def test_table_by_hand(written):
-    frames = [
-        frame_of("1/b", [BOX, BOX], ["Bicycle", "Sedan"]),
-        frame_of("1/a"),
-        frame_of("1/c", [BOX], ["Pedestrian"]),
-    ]
+    frames = [frame_of("1/b", [BOX, BOX], ["Bicycle", "Sedan"]), frame_of("1/a")]
+    frames.append(frame_of("1/c", [BOX], ["Pedestrian"]))
     table = make_table(written, frames, max_objects=2, classes=("Sedan", "Bicycle"))
     assert table.keys == (("1/b",), ("1/a",), ("1/c",))
     assert table.classes.tolist() == [[1, 0], [-1, -1], [-1, -1]]
@@ -335,20 +321,17 @@ def test_targets_are_columns_of_the_kept_objects(written):
         ),
         frame_of("1/a", [BOX], ["Sedan"]),
     ]
-    table = make_table(
-        written, frames, max_objects=2, classes=("Sedan",), targets=("v",)
-    )
+    options = {"max_objects": 2, "classes": ("Sedan",)}
+    table = make_table(written, frames, targets=("v",), **options)
     nan = np.nan
     expected = [[[3, nan], [nan, nan]], [[nan, nan], [nan, nan]]]
     np.testing.assert_array_equal(table.targets["v"], expected)
     with pytest.raises(UserError, match=r"targets is 'w', expected a column .*: v$"):
-        make_table(written, frames, max_objects=2, targets=("w",))
+        make_table(written, frames, targets=("w",), **options)
 
 
 def test_targets_and_augmented_samples_come_with_the_batch(records, data):
-    frames = [
-        dataclasses.replace(frame, columns={"x": frame.boxes[:, 0]}) for frame in data
-    ]
+    frames = [dataclasses.replace(x, columns={"x": x.boxes[:, 0]}) for x in data]
 
     def shifted(sample, rng):
         projection = sample.projection + np.float16(rng.uniform())
@@ -373,10 +356,7 @@ def test_targets_and_augmented_samples_come_with_the_batch(records, data):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (
-            lambda x: x[1:],
-            r"\(15, 12, 11\) float16, expected \(16, 12, 11\) float16, as",
-        ),
+        (lambda x: x[1:], r"\(15, 12, 11\) float16, expected \(16, 12, 11\) float16,"),
         (lambda x: x.astype(complex), "complex128, expected"),
     ],
 )

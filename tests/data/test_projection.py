@@ -1,5 +1,3 @@
-from typing import Any
-
 import chex
 import jax
 import jax.numpy as jnp
@@ -48,9 +46,7 @@ LAYOUTS = {
     "C": np.ascontiguousarray,
     "column-major": np.asfortranarray,
     "strided": lambda t: np.repeat(t, 2, axis=3)[..., ::2],
-    "permuted": lambda t: np.ascontiguousarray(t.transpose(1, 3, 0, 2)).transpose(
-        2, 0, 3, 1
-    ),
+    "permuted": lambda t: t.transpose(1, 3, 0, 2).copy().transpose(2, 0, 3, 1),
     "big-endian": lambda t: t.astype(t.dtype.newbyteorder(">")),
     "read-only": lambda t: np.frombuffer(t.tobytes(), t.dtype).reshape(t.shape),
 }
@@ -128,18 +124,12 @@ def test_jax_on_one_frame_and_on_batches():
     [np.ones((2, 3, 4)), np.ones((2, 0, 3, 4)), np.ones(SHAPE, complex), "text"],
 )
 def test_what_is_no_tesseract(tesseract):
-    with pytest.raises(
-        UserError, match=r"a tesseract is a real array \[Doppler, range"
-    ):
+    with pytest.raises(UserError, match=r"a tesseract is a real array \[Doppler,"):
         project_tensor(tesseract)
 
 
-# Half a step of the type below 1, in decibels of power.
-MAX_ERROR_DB = {
-    "float16": 2.0**-12 * 184.3,
-    "uint8": 0.5 / 255 * 184.3,
-    "float32": 2.0**-25 * 184.3,
-}
+# Half a step of the type below 1.
+MAX_ERROR = {"float16": 2.0**-12, "uint8": 0.5 / 255, "float32": 2.0**-25}
 
 
 @settings(deadline=None, max_examples=50)
@@ -150,8 +140,8 @@ MAX_ERROR_DB = {
 def test_error_is_what_is_stated(levels, encoding):
     stored = encode(levels, encoding)
     assert stored.dtype == encoding
-    error_db = np.abs(decode(stored).astype(np.float64) - levels).max() * 184.3
-    assert error_db <= MAX_ERROR_DB[encoding] * (1 + 1e-3)
+    error = np.abs(decode(stored).astype(np.float64) - levels).max()
+    assert error <= MAX_ERROR[encoding] * (1 + 1e-3)
     clipped = encode(np.array([-0.2, 0.5, 1.3], np.float32), "uint8")
     assert clipped.tolist() == [0, 128, 255]  # 127.5 to even
 
@@ -165,7 +155,7 @@ def test_device_and_host_decode_alike(encoding):
     chex.assert_trees_all_close(found, decode(stored), rtol=1e-6, atol=0)
 
 
-def _image(kind: str) -> np.ndarray:
+def _image(kind):
     """One range-azimuth image of a single look in a unit."""
     power = np.random.default_rng(0).exponential(1e5, (64, 50, 2))
     power[20:24, 10:14] *= 1e4
@@ -175,21 +165,14 @@ def _image(kind: str) -> np.ndarray:
         "amplitude": np.sqrt(power),
         "db": 10 * np.log10(power),
         "steps": np.rint(20 * np.log10(power)).astype(np.uint8),
-        "negative db": 10 * np.log10(power) - 100,
     }[kind]
 
 
 @pytest.mark.parametrize(
-    ("kind", "unit", "step"),
-    [
-        ("power", "power", 0.0),
-        ("averaged_power", "averaged_power", 0.0),
-        ("amplitude", "amplitude", 0.0),
-        ("db", "db", 0.0),
-        ("steps", "db", 0.5),
-    ],
+    "kind", ["power", "averaged_power", "amplitude", "db", "steps"]
 )
-def test_units_are_converted_to_power(kind: str, unit: Any, step: float) -> None:
+def test_units_are_converted_to_power(kind):
+    unit, step = ("db", 0.5) if kind == "steps" else (kind, 0.0)
     power = linear_power(_image(kind), unit, "a.npy", db_per_step=step)
     expected = _image("averaged_power" if kind == "averaged_power" else "power")
     assert power.dtype == np.float32
@@ -199,28 +182,18 @@ def test_units_are_converted_to_power(kind: str, unit: Any, step: float) -> None
 @pytest.mark.parametrize(
     ("kind", "unit", "message"),
     [
-        (
-            "amplitude",
-            "power",
-            r"noise rises by [34]\.\d dB .* as if values were 'amplitude'",
-        ),
-        (
-            "power",
-            "amplitude",
-            r"noise rises by 1[56]\.\d dB .* as if values were 'power'",
-        ),
+        ("amplitude", "power", r"by [34]\.\d dB .* as if values were 'amplitude'"),
+        ("power", "amplitude", r"by 1[56]\.\d dB .* as if values were 'power'"),
     ],
 )
-def test_values_of_another_unit_are_refused(kind: str, unit: Any, message: str) -> None:
+def test_values_of_another_unit_are_refused(kind, unit, message):
     with pytest.raises(DataError, match=f"^a.npy, read as '{unit}': {message}"):
         linear_power(_image(kind), unit, "a.npy")
 
 
-def test_ranges_may_be_another_axis() -> None:
+def test_ranges_may_be_another_axis():
     values = _image("amplitude").swapaxes(0, 1)
-    far = (
-        values * np.geomspace(1e3, 1, 64)[None, :, None]
-    )  # noise that differs in range
+    far = values * np.geomspace(1e3, 1, 64)[:, None]  # noise that differs in range
     with pytest.raises(DataError, match=r"noise rises by [34]\.\d dB"):
         linear_power(far, "power", "a.npy", range_axis=1)
 
@@ -233,14 +206,8 @@ def test_problems_of_files_and_in_programs_are_the_same():
     negative[0, 0, 0, 0], one_nan[0, 0, 0, 0] = -1.0, np.nan
     empty[..., :1] = 0.0
     decibels = rng.uniform(1.1, 299.0, SHAPE)
-    for number, tensor in (
-        (None, power),
-        (0, negative),
-        (0, one_nan),
-        (1, empty),
-        (2, np.full(SHAPE, 7.0)),
-        (3, decibels),
-    ):
+    cases = [(None, power), (0, negative), (0, one_nan), (1, empty)]
+    for number, tensor in [*cases, (2, np.full(SHAPE, 7.0)), (3, decibels)]:
         tensor = tensor.astype(np.float32)
         projection = np.asarray(project_jax(tensor))
         beams = projection[..., SHAPE[0] :].max(axis=0)

@@ -21,6 +21,8 @@ from radejax.geometry.radar_grid import RadarGrid
 
 from .. import small_models as small
 
+KRADAR = RadarGrid.kradar()
+
 
 @pytest.fixture(scope="module")
 def data(kradar_root):
@@ -82,9 +84,7 @@ def test_corrupted_records_are_named(data, copy):
     other = np.zeros(records.shape, np.float32)
     for part in (content[:-1], content[:100], content[:7], b"", b"PK\3\4", b"x" * 300):
         path.write_bytes(part)
-        with pytest.raises(
-            DataError, match=rf"{key}\.npy: corrupted.*delete it and write it again"
-        ):
+        with pytest.raises(DataError, match=rf"{key}\.npy: corrupted.*delete it and"):
             records[key]
     for array in (other, other[:1].astype(np.float16), np.array([None])):
         np.save(path, array, allow_pickle=True)
@@ -111,9 +111,7 @@ def test_corrupted_descriptions_are_named(copy, change, message):
     with pytest.raises(DataError, match="is not valid JSON"):
         open_projections(copy)
     path.unlink()
-    with pytest.raises(
-        FileNotFoundError, match=r"no manifest\.json; expected a folder"
-    ):
+    with pytest.raises(FileNotFoundError, match=r"no manifest\.json; expected a"):
         open_projections(copy)
 
 
@@ -160,10 +158,8 @@ def test_resumes_after_a_kill(data, folder, root, tmp_path):
     blocked.unlink()
     os.mkfifo(blocked)  # a worker waits there forever
     (tmp_path / "job.py").write_text(_JOB)
-    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
-    job = subprocess.Popen(
-        [sys.executable, tmp_path / "job.py", root, out], env=environment
-    )
+    command = [sys.executable, tmp_path / "job.py", root, out]
+    job = subprocess.Popen(command, env={**os.environ, "JAX_PLATFORMS": "cpu"})
     wait_until(lambda: len(list(out.rglob("*.npy"))) == 7)
     job.send_signal(signal.SIGKILL)
     job.wait()
@@ -185,14 +181,9 @@ def test_an_interrupt_of_all_processes_is_one_line(root, tmp_path):
         "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from radejax.cli.main import main; main(prog_name='radejax')"
     )
+    words = [sys.executable, "-c", command, "preprocess", root, "--out", out]
     job = subprocess.Popen(
-        [
-            *(sys.executable, "-c", command, "preprocess"),
-            root,
-            "--out",
-            out,
-            "--workers=2",
-        ],
+        [*words, "--workers=2"],
         env={**os.environ, "JAX_PLATFORMS": "cpu"},
         stderr=subprocess.PIPE,
         text=True,
@@ -217,9 +208,7 @@ def test_bad_frames_are_skipped_counted_and_tried_again(root, tmp_path):
     assert list(report.skipped) == ["1/00005_00002", "2/00009_00006"]
     assert "skipped 2/00009_00006: no radar tensor in any root" in report.to_text()
     assert "skipped 1/00005_00002: " in report.to_text()
-    with pytest.raises(
-        UserError, match=r"2 of 12 .* is 1/00005_00002: run `radejax pr"
-    ):
+    with pytest.raises(UserError, match=r"2 of 12 .* is 1/00005_00002: run `radejax"):
         open_projections(out).require(data)
     bad.write_bytes(content)
     report = run(data, out)
@@ -278,12 +267,10 @@ def test_a_folder_has_records_of_one_kind(data, tmp_path):
     records = open_projections(tmp_path)
     exact = project_file(data[0].tesseract_path)
     assert np.abs(records[data[0].key] / 255 - exact).max() <= 0.5001 / 255
-    with pytest.raises(
-        UserError, match=r"other records: options\.dtype is 'uint8' there"
-    ):
+    with pytest.raises(UserError, match=r"other records: options\.dtype is 'uint8'"):
         run(data, tmp_path, dtype="float16")
     with pytest.raises(UserError, match=r"options\.source\.grid\.azimuth_rad differs"):
-        run(LabeledFrames(data, RadarGrid.kradar()), tmp_path)
+        run(LabeledFrames(data, KRADAR), tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -292,10 +279,7 @@ def test_a_folder_has_records_of_one_kind(data, tmp_path):
         (lambda data, _: run(LabeledFrames([], data.grid), "x"), "no frames to preproc"),
         (lambda data, _: run(data, "x", dtype="int4"), "dtype is 'int4', expected one of"),
         (lambda data, _: run(data, "x", shard=(2, 2)), "i from 0 to n - 1"),
-        (
-            lambda _, folder: open_projections(folder, RadarGrid.kradar()),
-            r"6 x 16 x 5 x 12 bins.*expected 64 x 256 x 37",
-        ),
+        (lambda _, folder: open_projections(folder, KRADAR), r"6 x 16 x 5 x 12 bins.*64 x 256 x"),
         (lambda _, folder: open_embeddings(folder), "not embeddings of images"),
     ],
 )  # fmt: skip
@@ -310,11 +294,8 @@ def test_uneven_axes_are_kept_and_told_apart(tmp_path):
     Records.create(tmp_path, uneven.projection_shape, "float16", source)
     assert open_projections(tmp_path, uneven).grid == uneven
     first, last = uneven.azimuth_rad[[0, -1]]
-    even = small.uneven_grid(
-        azimuth_rad=np.linspace(first, last, 14), range_m=np.linspace(2.0, 30.0, 16)
-    )
-    with pytest.raises(
-        UserError,
-        match=r"of 4 x 16 x 0 x 14 bins.*, not uniform, expected .* deg: .*--records",
-    ):
+    axes = {"azimuth_rad": np.linspace(first, last, 14)}
+    even = small.uneven_grid(range_m=np.linspace(2.0, 30.0, 16), **axes)
+    message = r"of 4 x 16 x 0 x 14 bins.*, not uniform, expected .* deg: .*--records"
+    with pytest.raises(UserError, match=message):
         open_projections(tmp_path, even)

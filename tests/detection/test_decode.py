@@ -22,9 +22,8 @@ C = 3
 RELEASED = D.DecodeOptions(max_detections=16, threshold_inclusive=False)
 
 _decode = jax.jit(D.decode, static_argnames=("grid", "options", "pre_nms"))
-_find_peaks = jax.jit(
-    D.find_peaks, static_argnames=("grid", "max_peaks", "threshold_inclusive")
-)
+_STATIC = ("grid", "max_peaks", "threshold_inclusive")
+_find_peaks = jax.jit(D.find_peaks, static_argnames=_STATIC)
 
 
 def decode(maps, grid, *, roi=None, pre_nms=None, **options):
@@ -156,13 +155,9 @@ def test_peaks_equal_the_definition(seed, inclusive):
     peaks = find_peaks(maps, GRID, max_peaks=240, **options)
     count = int(peaks.num_found[0])
     assert count == len(expected)
-    found = zip(
-        peaks.scores[0, :count].tolist(),
-        peaks.classes[0, :count].tolist(),
-        *peaks.bins[0, :count].T.tolist(),
-        strict=True,
-    )
-    assert list(found) == [(float(s), c, i, j) for s, c, i, j in expected]
+    columns = peaks.scores[0], peaks.classes[0], *peaks.bins[0].T
+    found = [column[:count].tolist() for column in columns]
+    assert [*zip(*found, strict=True)] == expected
     assert not np.asarray(peaks.is_valid[0, count:]).any()
 
 
@@ -180,10 +175,8 @@ def test_every_class_has_its_threshold():
     rows = zip(found.scores[0].tolist(), found.classes[0].tolist(), strict=True)
     assert [*rows][:count] == [(float(score), cls) for score, cls, *_ in expected]
     assert {cls for _, cls, *_ in expected} == {0, 1, 2}
-    same, one = (
-        find_peaks(maps, GRID, max_peaks=240, score_threshold=threshold)
-        for threshold in (np.full(C, 0.4, np.float32), 0.4)
-    )
+    peaks = partial(find_peaks, maps, GRID, max_peaks=240)
+    same, one = peaks(score_threshold=thresholds * 0 + 0.4), peaks(score_threshold=0.4)
     jax.tree.map(np.testing.assert_array_equal, same, one)
 
 
@@ -388,6 +381,5 @@ def test_a_size_is_never_negative(raw_yaw):
     boxes = found.to_boxes()
     assert boxes.frame[boxes.is_clipped].tolist() == [0]
     np.testing.assert_array_equal(found.boxes[0, 1], released.boxes[0, 1])
-    assert float(released.boxes[0, 0, 3]) == (
-        np.float32(-0.2) if raw_yaw == "nms" else 0.0
-    )
+    length = np.float32(-0.2) if raw_yaw == "nms" else 0.0
+    assert released.boxes[0, 0, 3] == length

@@ -41,9 +41,8 @@ def write_table():
         columns = {name: np.asarray(column).tolist() for name, column in table.items()}
         columns["frame"] = [keys[i] for i in columns["frame"]]
         rows = zip(*columns.values(), strict=True)
-        return files.write_json(
-            path, [dict(zip(columns, r, strict=True)) for r in rows]
-        )
+        records = [dict(zip(columns, row, strict=True)) for row in rows]
+        return files.write_json(path, records)
 
     return write
 
@@ -60,9 +59,8 @@ def stored(scene, write_table, tmp_path):
     truth, found, frames = scene
     write_table(tmp_path / "found.json", found, frames)
     write_table(tmp_path / "truth.npz", truth, frames)
-    files.write_json(
-        tmp_path / "frames.json", {k: v.tolist() for k, v in frames.items()}
-    )
+    columns = {name: column.tolist() for name, column in frames.items()}
+    files.write_json(tmp_path / "frames.json", columns)
     return tmp_path, Source(ground_truth=str(tmp_path / "truth.npz"))
 
 
@@ -71,14 +69,9 @@ def two_runs(scene, tmp_path_factory):
     """Folder with the runs `a` and `b`, which have reports of three seeds each."""
     folder = tmp_path_factory.mktemp("runs")
     truth, found, frames = scene
-    options = ReportOptions(
-        roi=None,
-        plots=False,
-        protocols=("all_point", "kradar_r40"),
-        score_threshold=0.4,
-        min_score=0.1,
-        classes=("Sedan",),
-    )
+    options = {"roi": None, "plots": False, "protocols": ("all_point", "kradar_r40")}
+    options |= {"score_threshold": 0.4, "min_score": 0.1, "classes": ("Sedan",)}
+    options = ReportOptions(**options)
     for run, keep in (("a", 0.5), ("b", 0.9)):
         for seed in range(3):
             rows = np.random.default_rng(seed).random(len(found["score"])) < keep

@@ -24,9 +24,8 @@ def random_scene(seed, *, num_frames=12, num_objects=30, num_classes=2, ties=Tru
     )
     copies = rng.choice([0, 1, 2, 3], num_objects, p=[0.2, 0.4, 0.25, 0.15])
     source = np.repeat(np.arange(num_objects), copies)
-    found = box[source] + rng.normal(
-        0, [0.5, 0.4, 0.2, 0.3, 0.2, 0.1, 0.2], (source.size, 7)
-    )
+    noise = [0.5, 0.4, 0.2, 0.3, 0.2, 0.1, 0.2]
+    found = box[source] + rng.normal(0, noise, (source.size, 7))
     num_false = num_objects // 3
     false = box[rng.integers(0, num_objects, num_false)]
     false = false + rng.normal(0, 2, (num_false, 7)) * [1, 1, 0.2, 0, 0, 0, 1]

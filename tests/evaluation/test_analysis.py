@@ -11,12 +11,7 @@ from radejax.evaluation.report import write_report
 from radejax.evaluation.results import ReportOptions
 
 CLASSES = ("Sedan", "Bus or Truck")
-
-
-FRAMES = {
-    "frame": np.arange(4) + 100,
-    "time": np.array(["day", "day", "night", "night"]),
-}
+FRAMES = {"frame": np.arange(4) + 100, "time": np.repeat(["day", "night"], 2)}
 
 
 def make(truth_rows, found_rows):
@@ -119,9 +114,7 @@ def test_own_metrics_of_matched_boxes():
     gap = lambda a, b: abs(a.extras["speed"] - b.extras["speed"])  # noqa: E731
     errors = analysis.box_errors(data, 0.3, {"gap": gap})["Sedan"]
     assert (errors["count"], errors["gap_mean"]) == (3, (0.5 + 2.0) / 2)
-    with pytest.raises(
-        UserError, match=r"gap returned is \(1,\), expected an array \[3\]"
-    ):
+    with pytest.raises(UserError, match=r"gap returned is \(1,\), expected an array"):
         analysis.box_errors(data, 0.3, {"gap": lambda a, b: np.zeros(1)})
 
 
@@ -165,11 +158,7 @@ def _moved(found, column, change):
     ("column", "change", "expected"),
     [
         (6, np.rad2deg, r"60 predictions have \|yaw\| > 2 pi, up to 1\d\d"),
-        (
-            2,
-            lambda z: z + 0.7,
-            r", \+0.7\d\) m .*; --z-offset -0.7\d of `radejax score` moves",
-        ),
+        (2, lambda z: z + 0.7, r", \+0.7\d\) m .*; --z-offset -0.7\d of `radejax"),
         (0, lambda x: x + 2.54, r"\(\+2.\d\d, .* LiDAR frame \+ \(-2.54, 0.3, 0\)"),
         (0, np.negative, r"60 of 60 predictions lie behind the sensor \(x < 0\)"),
         ([3, 4, 5], lambda size: size / 2, r"have 0.5\d, 0.5\d, 0.5\d times"),

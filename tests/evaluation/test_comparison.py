@@ -3,27 +3,16 @@ import json
 import numpy as np
 import pytest
 import scipy.stats
-from click.testing import CliRunner
 
-from radejax.cli.main import main
 from radejax.core.errors import UserError
-from radejax.evaluation import kitti
-from radejax.evaluation.comparison import (
-    compare,
-    compare_files,
-    comparison_tables,
-    difference,
-)
+from radejax.evaluation import comparison, kitti, results
+from radejax.evaluation.comparison import compare, compare_files, difference
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.files import Source, evaluate_files, stored_options
 from radejax.evaluation.report import write_report
-from radejax.evaluation.results import (
-    ReportOptions,
-    interval,
-    resample,
-    sequence_weights,
-)
+from radejax.evaluation.results import ReportOptions
 
+from ..commands import run
 from .scenes import random_scene
 
 CLASSES = ("Sedan", "Bus or Truck")
@@ -31,12 +20,8 @@ TRUTH, FOUND, FRAMES = random_scene(1, num_frames=60, num_objects=200, ties=Fals
 
 
 def settings(**options):
-    defaults = {
-        "classes": CLASSES,
-        "protocols": ("all_point",),
-        "iou_thresholds": (0.3,),
-    }
-    return ReportOptions(**{**defaults, "bootstrap": 50, "roi": None, **options})
+    defaults = {"protocols": ("all_point",), "iou_thresholds": (0.3,), "bootstrap": 50}
+    return ReportOptions(**defaults | {"classes": CLASSES, "roi": None} | options)
 
 
 def make(truth=TRUTH, found=FOUND, frames=FRAMES, classes=CLASSES):
@@ -92,9 +77,11 @@ def test_the_comparison_is_paired():
     row = compare({"": one}, {"": other}, FRAMES, options, spaces=["bev"])[0]
     samples = []
     for seed, data in enumerate((other, one)):
-        weights = sequence_weights(FRAMES["sequence"], resamples=300, seed=seed)
-        samples.append(resample(data, weights, "all_point", "bev", 0.3)[:, 0])
-    low, high = interval(samples[0] - samples[1])
+        terms = {"resamples": 300, "seed": seed}
+        weights = results.sequence_weights(FRAMES["sequence"], **terms)
+        ap = results.resample(data, weights, "all_point", "bev", 0.3)
+        samples.append(ap[:, 0])
+    low, high = results.interval(samples[0] - samples[1])
     assert row.high - row.low < 0.7 * (high - low)
 
 
@@ -114,14 +101,9 @@ def test_a_class_in_one_sequence_is_not_tested(num_seeds, in_one):
         elif row.kind == "all":
             assert not np.isnan(values).any()
             assert (row.is_significant is None) == (num_seeds == 1)
-    words = {
-        cell
-        for table in comparison_tables(rows, "a", "b")
-        for row in table.rows
-        for cell in row
-    }
-    assert ("not tested" in words) == (num_seeds == 3 and in_one != CLASSES)
-    assert "-" in words
+    text = str([table.rows for table in comparison.comparison_tables(rows, "a", "b")])
+    assert ("'not tested'" in text) == (num_seeds == 3 and in_one != CLASSES)
+    assert "'-'" in text
 
 
 # Seeds --------------------------------------------------------------------------------
@@ -130,9 +112,8 @@ def test_a_class_in_one_sequence_is_not_tested(num_seeds, in_one):
 def drawn_aps(rng, of_seeds, num_seeds=3, num_sequences=12, num_resamples=100):
     """APs of the seeds of two runs that do not differ, over all sequences and resamples."""
     easy = rng.normal(0, 5, num_sequences)  # the same for all trainings
-    weights = rng.multinomial(
-        num_sequences, np.full(num_sequences, 1 / num_sequences), num_resamples
-    )
+    shares = np.full(num_sequences, 1 / num_sequences)
+    weights = rng.multinomial(num_sequences, shares, num_resamples)
     weights = np.concatenate([np.ones((1, num_sequences)), weights]) / num_sequences
     skill = rng.normal(60, of_seeds, (2, num_seeds, 1))
     aps = skill + easy + rng.normal(0, 1, (2, num_seeds, num_sequences))
@@ -178,9 +159,8 @@ def test_a_gain_has_its_deviation_and_is_paired_by_seed():
 
 # Runs in files ------------------------------------------------------------------------
 
-OPTIONS = ReportOptions(
-    bootstrap=30, roi=None, plots=False, protocols=("all_point", "kradar_r40")
-)
+PROTOCOLS = ("all_point", "kradar_r40")
+OPTIONS = ReportOptions(bootstrap=30, roi=None, plots=False, protocols=PROTOCOLS)
 
 
 def test_comparisons_are_the_stored_ones(
@@ -217,20 +197,13 @@ def test_predictions_in_files_are_compared(stored, scene, write_table):
     none = OPTIONS.replace(bootstrap=0)
     with pytest.raises(UserError, match="needs 1 resample or more, or only --figures"):
         compare_files(paths, folder / "out", source, none)
-    text, rows_of_none = compare_files(
-        paths, folder / "out", source, none, figures="png"
-    )
-    assert (text, rows_of_none) == (
-        "no table without resamples: --bootstrap is 0\n",
-        [],
-    )
+    text, no_rows = compare_files(paths, folder / "out", source, none, figures="png")
+    assert (text, no_rows) == ("no table without resamples: --bootstrap is 0\n", [])
     assert (folder / "out" / "comparison_3d_iou30.png").exists()
     words = ["compare", *paths, "--bootstrap", 30, "--roi", "none", "--json"]
     words += ["--ground-truth", source.ground_truth]
     words += ["--protocols", "all_point,kradar_r40"]
-    done = CliRunner().invoke(main, [str(word) for word in words])
-    assert done.exit_code == 0, done.stderr
-    assert json.loads(done.stdout) == rows
+    assert json.loads(run(*words).stdout) == rows
 
 
 def test_named_protocols_are_compared_besides_all_point(stored):
@@ -242,8 +215,7 @@ def test_named_protocols_are_compared_besides_all_point(stored):
         ([], {"all_point", "kradar_r40"}),
         (["--protocols", "voc11,auc"], {"all_point", "voc11", "auc"}),
     ):
-        done = CliRunner().invoke(main, [*words, *named])
-        rows = json.loads(done.stdout)
+        rows = json.loads(run(*words, *named).stdout)
         assert {row["protocol"] for row in rows if row["kind"] == "all"} == expected
         others = {row["protocol"] for row in rows if row["kind"] != "all"}
         assert others == {"all_point"}
@@ -302,10 +274,7 @@ def test_incomparable_runs_are_reported(scene, tmp_path):
     moved = make({**TRUTH, "box": TRUTH["box"] + 0.1})
     three = make(classes=(*CLASSES, "Bicycle"))
     for call, message in (
-        (
-            lambda: compare_files([tmp_path] * 2, None, Source(), OPTIONS),
-            "no column seq",
-        ),
+        (lambda: compare_files([tmp_path] * 2, None, Source(), OPTIONS), "no column"),
         (lambda: compare({"": data}, {"": moved}, FRAMES, once), "different objects"),
         (lambda: compare({"": data}, {"": three}, FRAMES, once), "different classes"),
     ):

@@ -174,9 +174,8 @@ def test_region_and_classes_filter_both_sides_and_are_in_the_name(roi):
         for side in ("ground truth", "predictions")
         for reason in ("class not evaluated", "center outside the region of interest")
     }
-    assert data.results("kradar_r40", score_threshold=0.3)[-1].metric == (
-        "ap_3d_iou30/kradar_r40/score>0.3/skip=frame/labels=v2.1/roi=narrow"
-    )
+    name = "ap_3d_iou30/kradar_r40/score>0.3/skip=frame/labels=v2.1/roi=narrow"
+    assert data.results("kradar_r40", score_threshold=0.3)[-1].metric == name
 
 
 # Laws -----------------------------------------------------------------------------------
@@ -225,9 +224,8 @@ def test_the_order_of_frames_does_not_matter(seed, protocol):
         order = np.argsort(frame, kind="stable")
         moved.append({k: v[order] for k, v in {**columns, "frame": frame}.items()})
     terms = {"classes": TWO, "protocol": protocol, "frames": frames}
-    np.testing.assert_allclose(
-        aps(truth, found, **terms), aps(*moved, **terms), atol=1e-10
-    )
+    expected = aps(truth, found, **terms)
+    np.testing.assert_allclose(aps(*moved, **terms), expected, atol=1e-10)
 
 
 @settings(deadline=None, max_examples=10, derandomize=True)
@@ -268,10 +266,9 @@ def test_weights_repeat_frames():
         copies.append({k: np.concatenate([p[k] for p in parts]) for k in parts[0]})
     data = EvaluationSet(truth, found, classes=TWO, frames=frames)
     for protocol in ("all_point", "kradar_r40", "kradar_r11", "kradar_r40_corrected"):
-        weighted = data.results(protocol, iou_thresholds=(0.2, 0.5), weights=weight)
-        repeated = evaluate(
-            *copies, classes=TWO, protocol=protocol, iou_thresholds=(0.2, 0.5)
-        )
+        terms = {"protocol": protocol, "iou_thresholds": (0.2, 0.5)}
+        weighted = data.results(weights=weight, **terms)
+        repeated = evaluate(*copies, classes=TWO, **terms)
         for one, other in zip(weighted, repeated, strict=True):
             assert one.num_gt == other.num_gt
             np.testing.assert_allclose(one.ap, other.ap, atol=1e-9)

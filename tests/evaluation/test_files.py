@@ -3,10 +3,8 @@ import shutil
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 import radejax
-from radejax.cli.main import main
 from radejax.core.errors import DataError, UserError
 from radejax.data.kradar import KRadar
 from radejax.evaluation import boxes, files, kitti
@@ -14,6 +12,7 @@ from radejax.evaluation.files import Source
 from radejax.evaluation.report import write_report
 from radejax.evaluation.results import ReportOptions
 
+from ..commands import run
 from ..data.conftest import write_kradar
 from .scenes import random_scene
 
@@ -151,17 +150,13 @@ def test_wrong_sources_are_named(stored):
 
 def test_every_way_in_gives_the_same_numbers(stored, scene):
     folder, source = stored
-    options = ReportOptions(
-        roi=None, plots=False, protocols=("all_point", "kradar_r40")
-    )
+    protocols = ("all_point", "kradar_r40")
+    options = ReportOptions(roi=None, plots=False, protocols=protocols)
 
     def aps(path, source, protocol=None, condition="all"):
         made = files.evaluate_files(path, folder / f"{path.name}_out", source, options)
-        return [
-            row.ap_or_none
-            for row in made.results
-            if row.condition == condition and protocol in (None, row.protocol)
-        ]
+        rows = [row for row in made.results if row.condition == condition]
+        return [x.ap_or_none for x in rows if protocol in (None, x.protocol)]
 
     one = aps(folder / "found.json", source)
     # A report contains everything that is needed to repeat it.
@@ -257,12 +252,10 @@ def test_a_config_of_another_program_has_no_classes(stored):
 
 def test_own_classes_that_are_not_chosen_are_known(scene, tmp_path):
     *tables, frames = scene
-    tables = [
-        {**x, "cls": np.where(x["cls"] == "Sedan", "Car", "Tram")} for x in tables
-    ]
-    options = ReportOptions(
-        roi=None, plots=False, protocols=("all_point",), classes=("Car", "Tram")
-    )
+    names = (np.where(x["cls"] == "Sedan", "Car", "Tram") for x in tables)
+    tables = [{**x, "cls": cls} for x, cls in zip(tables, names, strict=True)]
+    options = ReportOptions(roi=None, plots=False, protocols=("all_point",))
+    options = options.replace(classes=("Car", "Tram"))
     part = options.replace(classes=("Car",), known_classes=options.classes)
     for name, of in (("all", options), ("part", part)):
         write_report(*tables, frames, tmp_path / name, of)
@@ -271,8 +264,7 @@ def test_own_classes_that_are_not_chosen_are_known(scene, tmp_path):
         ("score", tmp_path / "part", "--classes", "Tram"),
         ("compare", tmp_path / "part", tmp_path / "all"),
     ):
-        done = CliRunner().invoke(main, [*map(str, words), "--bootstrap", "2"])
-        assert done.exit_code == 0, done.stderr
+        run(*words, "--bootstrap", 2)
 
 
 def test_results_of_a_folder_are_named_after_it(two_runs, tmp_path, monkeypatch):
@@ -281,25 +273,20 @@ def test_results_of_a_folder_are_named_after_it(two_runs, tmp_path, monkeypatch)
         shutil.copytree(two_runs / "a" / "seed0" / "evaluation", tmp_path / name)
     monkeypatch.chdir(tmp_path / names[1])
     for place in (f"../{names[0]}", "."):
-        done = CliRunner().invoke(main, ["score", place, "--bootstrap", "0"])
-        assert done.exit_code == 0, done.output
+        run("score", place, "--bootstrap", 0)
     for name in names:
         metrics = tmp_path / f"{name}_evaluation" / "metrics.json"
         assert json.loads(metrics.read_text())["run"] == name
 
 
 def test_scoring_a_run_repeats_its_report(two_runs, tmp_path):
-    run = two_runs / "a" / "seed0"
-    words = ["score", str(run), "--out", str(tmp_path), "--bootstrap", "0"]
-    done = CliRunner().invoke(main, words)
-    assert done.exit_code == 0, done.output
+    seed = two_runs / "a" / "seed0"
+    run("score", seed, "--out", tmp_path, "--bootstrap", 0)
     for name in ("metrics.csv", "tables.md"):
-        one, other = (place / name for place in (run / "evaluation", tmp_path))
+        one, other = (place / name for place in (seed / "evaluation", tmp_path))
         text = one.read_text().replace("| a ", "| seed0 ")
         assert text == other.read_text()
-    done = CliRunner().invoke(main, ["score", str(run.parent)])
-    assert done.exit_code == 2
-    assert "holds several seeds" in done.stderr
+    assert "holds several seeds" in run("score", seed.parent, code=2).stderr
 
 
 @pytest.mark.parametrize(
@@ -319,42 +306,38 @@ def test_classes_that_do_not_exist_are_wrong_use(
     write_table(tmp_path / "truth.json", table, ids)
     words = ["score", tmp_path / "found.json", "--classes", classes]
     words += ["--ground-truth", tmp_path / "truth.json", "--protocols", "all_point"]
-    done = CliRunner().invoke(main, [str(word) for word in words])
-    assert done.exit_code == (2 if message else 0)
+    done = run(*words, code=2 if message else 0)
     assert (message or "") in done.stderr
 
 
-@pytest.mark.parametrize("name", ["metrics.json", "ground_truth.npz", "frames.json"])
-def test_a_part_of_a_report_has_no_score(two_runs, tmp_path, name):
+@pytest.mark.parametrize(
+    ("name", "code", "reason"),
+    [
+        ("metrics.json", 2, "metrics.json"),
+        ("ground_truth.npz", 2, "ground_truth.npz"),
+        ("frames.json", 1, "expected one of the frames that are eval"),
+    ],
+)
+def test_a_part_of_a_report_has_no_score(two_runs, tmp_path, name, code, reason):
     shutil.copytree(two_runs / "a" / "seed0" / "evaluation", tmp_path / "report")
     (tmp_path / "report" / name).unlink()
-    done = CliRunner().invoke(main, ["score", str(tmp_path / "report")])
-    assert done.exit_code != 0
-    assert "Traceback" not in done.output
-    reason = "expected one of the frames that are eval" if name[0] == "f" else name
-    assert reason in done.stderr
+    assert reason in run("score", tmp_path / "report", code=code).stderr
 
 
 @pytest.mark.parametrize("name", ["metrics.json", "predictions.npz"])
 def test_reports_mixed_by_a_partial_copy_are_rejected(two_runs, tmp_path, name):
     one, other = (two_runs / "a" / x / "evaluation" for x in ("seed0", "seed1"))
     report = shutil.copytree(one, tmp_path / "report")
-    words = ["score", str(report), "--out", str(tmp_path / "out"), "--bootstrap", "0"]
-    assert CliRunner().invoke(main, words).exit_code == 0  # a whole copy
+    words = ["score", report, "--out", tmp_path / "out", "--bootstrap", 0]
+    run(*words)  # a whole copy
     shutil.copy(other / name, report)
-    compared = ["compare", str(other), str(report)]
-    for command in (words, compared, [*words, "--ground-truth", str(report)]):
-        done = CliRunner().invoke(main, command)
-        assert done.exit_code == 1
-        text = "predictions.npz is corrupted or of another folder: its sha256 differs"
-        assert text in done.stderr
+    text = "predictions.npz is corrupted or of another folder: its sha256 differs"
+    compared = ["compare", other, report]
+    for command in (words, compared, [*words, "--ground-truth", report]):
+        assert text in run(*command, code=1).stderr
     shutil.copytree(one, report, dirs_exist_ok=True)
     shutil.copy(other / "predictions.npz", report / "ground_truth.npz")
-    done = CliRunner().invoke(main, words)
-    assert (done.exit_code, "ground_truth.npz is corrupted or of" in done.stderr) == (
-        1,
-        True,
-    )
+    assert "ground_truth.npz is corrupted or of" in run(*words, code=1).stderr
 
 
 def test_a_report_replaces_all_of_an_earlier_one(stored, caplog):
@@ -377,13 +360,9 @@ def test_a_report_replaces_all_of_an_earlier_one(stored, caplog):
 
 def test_exported_boxes_are_those_that_count(stored):
     folder, source = stored
-    options = ReportOptions(
-        roi=(0, 15, -3, 3, -2, 6),
-        plots=False,
-        kitti=True,
-        score_threshold=0.3,
-        classes=("Sedan",),
-    )
+    region = (0, 15, -3, 3, -2, 6)
+    options = ReportOptions(roi=region, plots=False, kitti=True, classes=("Sedan",))
+    options = options.replace(score_threshold=0.3)
     made = files.evaluate_files(folder / "found.json", folder / "out", source, options)
     place = folder / "out" / "kitti" / "0.3" / "all"
     truth, found, _ = kitti.read_kitti(place)

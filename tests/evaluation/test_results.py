@@ -5,37 +5,24 @@ import pytest
 
 from radejax.core.errors import UserError
 from radejax.core.structures import Boxes
+from radejax.evaluation import results
 from radejax.evaluation.boxes import read_boxes, take
 from radejax.evaluation.evaluation_set import EvaluationSet
 from radejax.evaluation.protocols import PROTOCOLS
-from radejax.evaluation.results import (
-    ReportOptions,
-    compute_results,
-    condition_masks,
-    exclusion_counts,
-    interval,
-    make_set,
-    name_of_changes,
-    resample,
-    sequence_weights,
-)
+from radejax.evaluation.results import ReportOptions, make_set, resample
 
 from .scenes import random_scene
 
 CLASSES = ("Sedan", "Bus or Truck")
-OPTIONS = ReportOptions(
-    classes=CLASSES,
-    iou_thresholds=(0.3,),
-    roi=None,
-    bootstrap=20,
-    protocols=("all_point",),
-)
+OPTIONS = ReportOptions(iou_thresholds=(0.3,), roi=None, protocols=("all_point",))
+OPTIONS = OPTIONS.replace(classes=CLASSES, bootstrap=20)
 TRUTH, FOUND, FRAMES = random_scene(1, num_frames=60, num_objects=200, ties=False)
 
 
 def results_of(frames=FRAMES, truth=TRUTH, found=FOUND, **changes):
     options = OPTIONS.replace(**changes)
-    return compute_results(make_set(truth, found, frames, options), frames, options)
+    data = make_set(truth, found, frames, options)
+    return results.compute_results(data, frames, options)
 
 
 def intervals(frames, **changes):
@@ -45,17 +32,17 @@ def intervals(frames, **changes):
 
 def test_weights_draw_whole_sequences():
     sequence = np.array([7, 7, 3, 9, 9, 9])
-    weights = sequence_weights(sequence, resamples=500, seed=0)
+    weights = results.sequence_weights(sequence, resamples=500, seed=0)
     assert weights.shape == (500, 6)
     assert (weights[:, 0] == weights[:, 1]).all()
     assert (weights[:, 3:] == weights[:, 3:4]).all()
     per_sequence = weights[:, [0, 2, 3]]
     assert (per_sequence.sum(axis=1) == 3).all()
     np.testing.assert_allclose(per_sequence.mean(axis=0), 1, atol=0.15)
-    again = sequence_weights(sequence, resamples=500, seed=0)
+    again = results.sequence_weights(sequence, resamples=500, seed=0)
     np.testing.assert_array_equal(weights, again)
     with pytest.raises(UserError, match="at least 2 sequences to resample, found 1"):
-        sequence_weights(np.zeros(4), resamples=10, seed=0)
+        results.sequence_weights(np.zeros(4), resamples=10, seed=0)
 
 
 def test_weights_of_a_condition_give_the_condition():
@@ -63,8 +50,8 @@ def test_weights_of_a_condition_give_the_condition():
     fog = FRAMES["weather"] == "fog"
     for protocol in PROTOCOLS:
         ap = resample(data, fog[None].astype(int), protocol, "3d", 0.3)[0]
-        results = data.results(protocol, iou_thresholds=0.3, spaces="3d", weights=fog)
-        expected = [result.ap for result in results]
+        found = data.results(protocol, iou_thresholds=0.3, spaces="3d", weights=fog)
+        expected = [result.ap for result in found]
         np.testing.assert_allclose(ap[:2], expected, rtol=0, atol=1e-12)
         assert ap[2] == pytest.approx(ap[:2].mean())
     # Doubling every frame changes nothing but the rounding of recall steps.
@@ -76,8 +63,8 @@ def test_interval_covers_the_number():
     low, ap, high = intervals(FRAMES, bootstrap=200)["all", "Sedan", "3d"]
     assert low < ap < high
     samples = np.arange(101.0)
-    assert interval(samples) == pytest.approx((2.5, 97.5))
-    assert np.isnan(interval(np.full(5, np.nan))).all()
+    assert results.interval(samples) == pytest.approx((2.5, 97.5))
+    assert np.isnan(results.interval(np.full(5, np.nan))).all()
 
 
 def test_a_class_in_one_sequence_has_no_interval():
@@ -106,15 +93,11 @@ def test_conditions_of_one_sequence_get_no_interval():
 
 def test_means_are_over_classes_that_occur(scene):
     truth, found, frames = scene  # of two of the five classes
-    rows = results_of(
-        frames, truth, found, classes=("Sedan", "Bicycle", "Bus or Truck")
-    )
+    classes = ("Sedan", "Bicycle", "Bus or Truck")
+    rows = results_of(frames, truth, found, classes=classes)
     for condition in ("all", "fog"):
-        aps = {
-            row.cls: row.ap_or_none
-            for row in rows
-            if (row.condition, row.space) == (condition, "3d")
-        }
+        of_it = [x for x in rows if (x.condition, x.space) == (condition, "3d")]
+        aps = {row.cls: row.ap_or_none for row in of_it}
         assert aps["Bicycle"] is None
         assert aps["mean"] == pytest.approx((aps["Sedan"] + aps["Bus or Truck"]) / 2)
 
@@ -122,7 +105,7 @@ def test_means_are_over_classes_that_occur(scene):
 def test_excluded_boxes_and_frames_are_counted(scene):
     truth, found, frames = scene
     data = EvaluationSet(truth, found, frames=frames, roi=(6, 20, -4, 4, -3, 3))
-    counts = exclusion_counts(data, ReportOptions(score_threshold=0.3))
+    counts = results.exclusion_counts(data, ReportOptions(score_threshold=0.3))
     kept = len(data.gt) + counts["ground truth: center outside the region of interest"]
     assert kept == len(truth["frame"])
     above, empty = data.pred.score > 0.3, ~np.isin(np.arange(30), data.gt.frame)
@@ -140,32 +123,31 @@ def test_excluded_boxes_and_frames_are_counted(scene):
 def test_folders_are_named_after_options_that_change_numbers():
     usual = {"roi": "narrow", "split": "test"}
     changes = {"roi": "narrow", "bootstrap": 5, "kitti": True, "figures": "pdf"}
-    assert name_of_changes(changes, usual) == ""
+    assert results.name_of_changes(changes, usual) == ""
     changes |= {"roi": None, "classes": ("Sedan", "Bus or Truck"), "sequences": (5,)}
     expected = "_roi_None_classes_Sedan_Bus-or-Truck_sequences_5"
-    assert name_of_changes(changes, usual) == expected
-    assert name_of_changes({"split": "/a/b c.txt"}, usual) == "_split_-a-b-c.txt"
+    assert results.name_of_changes(changes, usual) == expected
+    found = results.name_of_changes({"split": "/a/b c.txt"}, usual)
+    assert found == "_split_-a-b-c.txt"
 
 
 def test_conditions_are_in_the_papers_order():
     frames = {"frame": [0] * 4, "weather": ["sleet", "martian", "normal", "fog"]}
-    masks = condition_masks(frames, "weather")
+    masks = results.condition_masks(frames, "weather")
     assert list(masks) == ["normal", "fog", "sleet", "martian"]
     assert masks["fog"].tolist() == [False, False, False, True]
-    assert condition_masks(frames, "time") == {}
+    assert results.condition_masks(frames, "time") == {}
 
 
 def test_dropped_predictions_and_classes_without_objects_are_counted(scene):
     truth, found, frames = scene
     names = np.where(np.arange(len(found["cls"])) < 3, "Bicycle", found["cls"])
     found = read_boxes({**found, "cls": names}, "predictions", scored=True)
-    parts = [
-        dataclasses.replace(found.take(np.array([i])), num_truncated=i)
-        for i in (0, 1, 2)
-    ]
+    one = found.take(np.array([0]))
+    parts = [dataclasses.replace(one, num_truncated=i) for i in (0, 1, 2)]
     found = Boxes.concatenate([*parts, found])
     options = ReportOptions(roi=None)
-    counts = exclusion_counts(make_set(truth, found, frames, options), options)
+    counts = results.exclusion_counts(make_set(truth, found, frames, options), options)
     assert counts["predictions: dropped at max_detections, as far as known"] == 3
     what = "predictions: of classes without ground truth, which have no AP"
     assert counts[what] == 6

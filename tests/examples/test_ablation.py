@@ -2,7 +2,6 @@
 
 import json
 import pathlib
-from typing import Any
 
 import ablation
 import numpy as np
@@ -21,26 +20,26 @@ SKILL = {"sigma 3": 0.4, "model": 0.7, "sigma 0.75": 0.9, "shuffled labels": 0.1
 class _Runs:
     """Replaces training and evaluation: a fraction of the objects is detected."""
 
-    def __init__(self, patch: pytest.MonkeyPatch) -> None:
-        self.trained: list[tuple[str, Any, Any]] = []
-        self.simulated: set[tuple[str, str]] = set()
-        self.stops_at: str | None = None
+    def __init__(self, patch):
+        self.trained = []
+        self.simulated = set()
+        self.stops_at = None
         patch.setattr(ablation.experiment, "run", self.run)
         patch.setattr(ablation, "evaluate_run", self.evaluate)
         patch.setattr(ablation, "simulate_dataset", self.simulate)
 
-    def simulate(self, simulation: Any, root: pathlib.Path) -> pathlib.Path:
+    def simulate(self, simulation, root):
         self.simulated.add((root.name, simulation.to_json()))
         return root
 
-    def run(self, config: Any, workdir: Any) -> None:
+    def run(self, config, workdir):
         name = workdir.parent.name.replace("_", " ")
         self.trained.append((name, config))
         if name != self.stops_at:
             (workdir / "evaluation").mkdir(parents=True)
             (workdir / "evaluation" / "metrics.json").write_text("{}")
 
-    def evaluate(self, folder: pathlib.Path, *, out: Any, **options: Any) -> None:
+    def evaluate(self, folder, *, out, **options):
         assert options["split"] == "all"
         frame, name = np.arange(60), folder.parent.name.replace("_", " ")
         box = np.tile([20.0, 0, 0, 4, 2, 1.5, 0], (60, 1))
@@ -56,16 +55,14 @@ class _Runs:
         )  # fmt: skip
 
 
-def _call(out: pathlib.Path, *more: str) -> str:
+def _call(out, *more):
     command = ["--table", "sigma", "--resamples", "40", "--out", str(out), *more]
     result = CliRunner().invoke(ablation.main, command, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     return result.output
 
 
-def test_what_is_missing_is_run_and_judged(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_missing_is_run_and_judged(tmp_path, monkeypatch):
     runs = _Runs(monkeypatch)
     runs.stops_at = "adaptive"  # as a signal does
     text = _call(tmp_path, "--seeds", "0")
@@ -84,7 +81,7 @@ def test_what_is_missing_is_run_and_judged(
 
 
 @pytest.mark.parametrize("table", sorted(ablation.STUDIES))
-def test_every_cell_is_a_config_and_its_command_makes_it(table: str) -> None:
+def test_every_cell_is_a_config_and_its_command_makes_it(table):
     study = ablation.STUDIES[table]
     work = ablation.Work(study, pathlib.Path("/none"))
     seen = []
@@ -93,10 +90,8 @@ def test_every_cell_is_a_config_and_its_command_makes_it(table: str) -> None:
         words = work.command(name, 2).split()
         file = ablation.CONFIGS.parent / words[words.index("--config") + 1]
         again = load_config(str(file))
-        given = (
-            word.removeprefix("--config.") for word in words if "--config." in word
-        )
-        texts = dict(text.split("=") for text in given)
+        given = [word for word in words if "--config." in word]
+        texts = dict(word.removeprefix("--config.").split("=") for word in given)
         assert with_texts(again, texts) == config
         if not cell.exchanges:
             seen.append((config.model_dump_json(), cell.release))

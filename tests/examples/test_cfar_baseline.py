@@ -1,24 +1,22 @@
 """The CFAR baseline from a dataset to its report."""
 
 import json
-import pathlib
 
 import cfar_baseline as module
 import pytest
 
 from radejax.data.kradar import KRadar
 from radejax.data.records import preprocess
-from radejax.simulation.config import SimulationOptions
-from radejax.simulation.dataset import simulate_dataset
+
+from .. import small_models as small
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+def data(tmp_path_factory):
     """A small dataset without images, with records."""
     root = tmp_path_factory.mktemp("data")
     size = {"train_sequences": 2, "test_sequences": 1, "frames_per_sequence": 4}
-    options = SimulationOptions(**size, image_width=0, output="projection")
-    simulate_dataset(options, root, progress=False)
+    small.simulate(root, **size, image_width=0)
     preprocess(KRadar(root), root / "records", num_workers=0, progress=False)
     return root
 

@@ -10,7 +10,7 @@ ROOT = pathlib.Path(__file__).resolve().parents[2]
 echo_accuracy = load_module(ROOT / "examples" / "echo_accuracy.py")
 
 
-def test_scenes_are_measured() -> None:
+def test_scenes_are_measured():
     arguments = ["--scenes", "4", "--range-bins", "32", "--cls", "Bicycle"]
     result = CliRunner().invoke(echo_accuracy.main, arguments)
     assert result.exit_code == 0, result.output

@@ -8,15 +8,13 @@ from online_batches import OnlineBatches
 from radejax.simulation.config import SimulationOptions
 
 GRID = {"num_doppler": 8, "num_range": 32, "num_elevation": 5, "num_azimuth": 24}
-OPTIONS = SimulationOptions(
-    train_sequences=3, frames_per_sequence=4, image_width=0, grid=GRID
-)
+SIZES = {"train_sequences": 3, "frames_per_sequence": 4, "image_width": 0}
 
 
 def batches(start_step=0):
-    return OnlineBatches(
-        OPTIONS, batch_size=3, max_objects=20, seed=4, start_step=start_step
-    )
+    options = SimulationOptions(grid=GRID, **SIZES)
+    sizes = {"batch_size": 3, "max_objects": 20}
+    return OnlineBatches(options, seed=4, start_step=start_step, **sizes)
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,6 @@
 """The example of another radar: its reader, its config, and a whole run."""
 
 import json
-import pathlib
 
 import own_radar
 import pytest
@@ -10,9 +9,7 @@ from click.testing import CliRunner
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("commands_on_one_device")
-def test_a_simulated_recording_is_trained_evaluated_and_drawn(
-    tmp_path: pathlib.Path,
-) -> None:
+def test_a_simulated_recording_is_trained_evaluated_and_drawn(tmp_path):
     root, run = tmp_path / "data", tmp_path / "run"
     arguments = [str(root), "--workdir", str(run), "--drives", "120", "--epochs", "1"]
     result = CliRunner().invoke(own_radar.main, arguments, catch_exceptions=False)

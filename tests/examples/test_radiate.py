@@ -18,7 +18,7 @@ CAMERA = {
 }  # fmt: skip
 
 
-def write_sequence(folder: pathlib.Path, num_frames: int) -> None:
+def write_sequence(folder, num_frames):
     """A car at 50 m to the right, in the layout of RADIATE."""
     for name in ("Navtech_Polar", "zed_left", "annotations"):
         (folder / name).mkdir(parents=True)
@@ -46,7 +46,7 @@ def write_sequence(folder: pathlib.Path, num_frames: int) -> None:
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory) -> pathlib.Path:
+def root(tmp_path_factory):
     root = tmp_path_factory.mktemp("radiate")
     write_sequence(root / "data" / "fog_1", 5)
     text = yaml.safe_dump({"left_cam_calib": CAMERA})
@@ -61,15 +61,8 @@ def test_written_files_are_trained_evaluated_and_drawn(root, tmp_path, monkeypat
     config = config.replace(model={"widths": (8, 16)}, train={"warmup_steps": 0})
     monkeypatch.setattr(radiate, "get_config", lambda: config)
     run = tmp_path / "run"
-    calibration = ["--calibration", str(root / "default-calib.yaml")]
-    arguments = [
-        str(root / "data"),
-        "--workdir",
-        str(run),
-        "--epochs",
-        "1",
-        *calibration,
-    ]
+    arguments = [str(root / "data"), "--workdir", str(run), "--epochs", "1"]
+    arguments += ["--calibration", str(root / "default-calib.yaml")]
     result = CliRunner().invoke(radiate.main, arguments, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     assert pathlib.Path(f"{run}.png").stat().st_size > 10_000

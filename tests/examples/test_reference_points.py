@@ -5,23 +5,14 @@ import numpy as np
 from matplotlib.figure import Figure
 from reference_points import draw_reference_points
 
-from radejax.geometry.camera import CameraCalibration
+from .. import small_models as small
 
 matplotlib.use("agg")
 
 
 def test_valid_points_and_the_radar_are_drawn_in_pixels():
     # The radar lies 2 m ahead of the camera and 1 m below its axis.
-    calibration = CameraCalibration.from_angles(
-        intrinsics=(50.0, 50.0, 50.0, 40.0),
-        yaw_deg=90.0,
-        pitch_deg=0.0,
-        roll_deg=90.0,
-        translation_m=(0.0, 0.0, 0.0),
-        radar_from_lidar_m=(-2.0, 0.0, 1.0),
-        width=100,
-        height=80,
-    )
+    calibration = small.forward_camera(radar_from_lidar_m=(-2.0, 0.0, 1.0))
     points = np.zeros((2, 2, 1, 2), np.float32)
     points[0, 0, 0] = 0.25, 0.5
     points[1, 1, 0] = 0.5, 0.75

@@ -19,12 +19,10 @@ def test_boxes_have_the_yaw_as_a_quaternion():
     rows = list(ros2_node.box_fields(detections, 0.7))
     assert [row[3:] for row in rows] == [("Sedan", 0.9), ("Pedestrian", 0.25)]
     for box, (position, quaternion, size, _, _) in zip(boxes[0], rows, strict=True):
-        np.testing.assert_allclose(
-            [*position, *size], np.add(box[:6], [0, 0, 0.7, 0, 0, 0])
-        )
-        np.testing.assert_allclose(
-            quaternion, [0, 0, np.sin(box[6] / 2), np.cos(box[6] / 2)]
-        )
+        shifted = box[:6] + np.array([0, 0, 0.7, 0, 0, 0])
+        np.testing.assert_allclose([*position, *size], shifted)
+        half = box[6] / 2
+        np.testing.assert_allclose(quaternion, [0, 0, np.sin(half), np.cos(half)])
 
 
 def test_points_are_float32_one_after_the_other():

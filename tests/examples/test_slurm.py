@@ -12,9 +12,7 @@ import pytest
 from radejax.cli.train import train
 
 SCRIPT = pathlib.Path(__file__).resolve().parents[2] / "examples" / "slurm.sh"
-DIRECTIVES = dict(
-    re.findall(r"^#SBATCH --([\w-]+)=(.*)$", SCRIPT.read_text(), re.MULTILINE)
-)
+DIRECTIVES = dict(re.findall(r"(?m)^#SBATCH --([\w-]+)=(.*)$", SCRIPT.read_text()))
 # Writes its arguments. It ends with `first`, or after SIGTERM with `second`.
 SRUN = """#!/bin/bash
 printf '%s\\n' "$@" > {folder}/arguments
@@ -34,6 +32,7 @@ echo "$@" >> {folder}/scontrol
 
 def _start(folder, first="waits", second=0, arguments=(), **variables):
     (folder / "bin").mkdir()
+    (folder / "scontrol").touch()
     for name, text in (("srun", SRUN), ("scancel", SCANCEL), ("scontrol", SCONTROL)):
         path = folder / "bin" / name
         path.write_text(text.format(folder=folder, first=first, second=second))
@@ -63,9 +62,7 @@ def test_a_job_at_its_time_limit_stops_and_is_queued_again(
     process.send_signal(signal.SIGUSR1)
     assert process.wait(timeout=20) == status
     assert (tmp_path / "scancel").read_text() == "--signal=TERM 7\n"
-    path = tmp_path / "scontrol"
-    requeued = path.read_text() if path.exists() else ""
-    assert requeued == "requeue 7\n" * is_requeued
+    assert (tmp_path / "scontrol").read_text() == "requeue 7\n" * is_requeued
 
 
 def test_srun_starts_the_preset_with_all_resources(tmp_path):

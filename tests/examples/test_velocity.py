@@ -1,7 +1,6 @@
 """The example of an own output: its config, its metrics, and a whole run."""
 
 import json
-import pathlib
 
 import pytest
 import velocity
@@ -10,7 +9,7 @@ from click.testing import CliRunner
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("commands_on_one_device")
-def test_a_whole_run(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_whole_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     done = CliRunner().invoke(velocity.main, ["--workdir", "run", "--preset", "short"])
     assert done.exit_code == 0, done.output

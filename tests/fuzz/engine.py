@@ -157,9 +157,9 @@ def run(jobs: list[Job]) -> list[Outcome]:
     lines = output.decode(errors="replace").split("\x1e")[:-1]
     parts = [line.split("\x1f", 3) for line in lines]
     found = [(name, int(number), kind, text) for name, number, kind, text in parts]
-    inputs = [
-        (name, n) for name, start, count in jobs for n in range(start, start + count)
-    ]
+    inputs = []
+    for name, start, count in jobs:
+        inputs += [(name, number) for number in range(start, start + count)]
     if len(found) < len(inputs):
         found.append((*inputs[len(found)], wrong, text))
     return found

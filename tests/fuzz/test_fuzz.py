@@ -7,12 +7,12 @@ from .readers import READERS
 
 
 @pytest.fixture(scope="module")
-def found() -> dict:
+def found():
     """Outcomes of all readers, from one process."""
     return engine.counts([(name, 0, reader.count) for name, reader in READERS.items()])
 
 
-def check(name: str, count: int, outcomes: tuple) -> None:
+def check(name, count, outcomes):
     counts, wrong = outcomes
     assert not wrong, f"{name}: {wrong[:3]}"
     assert sum(counts.values()) == count
@@ -20,16 +20,16 @@ def check(name: str, count: int, outcomes: tuple) -> None:
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_corrupted_inputs_are_read_or_rejected(name: str, found: dict) -> None:
+def test_corrupted_inputs_are_read_or_rejected(name, found):
     check(name, READERS[name].count, found[name])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", READERS)
-def test_many_more(name: str) -> None:
+def test_many_more(name):
     count = 50 * READERS[name].count
     check(name, count, engine.counts([(name, READERS[name].count, count)])[name])
 
 
-def test_the_corpus_belongs_to_readers() -> None:
+def test_the_corpus_belongs_to_readers():
     assert {folder.name for folder in engine.CORPUS.iterdir()} <= set(READERS)

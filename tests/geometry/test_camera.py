@@ -13,21 +13,10 @@ from radejax.core.errors import DataError, UserError
 from radejax.geometry import camera as camera_lib
 from radejax.geometry.camera import CameraCalibration
 
-from .. import small_models as small
+from ..small_models import forward_camera
 
 # Of K-Radar's cameras.
 DISTORTION = (-0.028873818, 0.0006023302, 0.0039573087, -0.0050471763, 0.0)
-
-
-def forward_camera(**fields) -> CameraCalibration:
-    """100 x 80 pixels, focal length 50, looking along x from the LiDAR."""
-    settings = {
-        "intrinsics": (50.0, 50.0, 50.0, 40.0),
-        "width": 100,
-        "height": 80,
-        "radar_from_lidar_m": (0.0, 0.0, 0.0),
-    }
-    return small.calibration(**(settings | fields))
 
 
 def of_lidar(camera, points):
@@ -97,9 +86,8 @@ def test_projection_of_a_real_frame(shared):
 
 def test_kradar_text_round_trip(tmp_path):
     angles = {"yaw_deg": 88.6, "pitch_deg": 0.6, "roll_deg": 89.6}
-    camera = forward_camera(
-        distortion=DISTORTION, translation_m=(0.18, -0.13, 0.0), **angles
-    )
+    fields = {"distortion": DISTORTION, "translation_m": (0.18, -0.13, 0.0)}
+    camera = forward_camera(**fields, **angles)
     path = tmp_path / "cam_1.yml"
     path.write_text(camera.to_kradar_text())
     again = CameraCalibration.from_kradar(path)
@@ -128,9 +116,8 @@ def test_box_edges_ahead_and_cut_at_the_near_plane():
 @pytest.mark.parametrize("image", ["raw", "pinhole"])
 def test_batches_of_cameras_under_jit(image):
     rng = np.random.default_rng(0)
-    calibrations = [
-        forward_camera(yaw_deg=yaw, distortion=DISTORTION) for yaw in (88, 90, 93)
-    ]
+    yaws = (88, 90, 93)
+    calibrations = [forward_camera(yaw_deg=x, distortion=DISTORTION) for x in yaws]
     points = rng.uniform([5, -3, -2], [60, 3, 2], (3, 6, 3))
     batch = camera_lib.stack_cameras([c.camera(image) for c in calibrations])
     chex.assert_shape(batch.cam_from_ego, (3, 3, 4))
@@ -189,16 +176,12 @@ def test_wrong_arguments_are_named(call, message):
     ],
 )
 def test_intrinsics_and_size_are_of_the_same_image(center_px, size_px, is_fine):
-    width, height = size_px
-    camera = forward_camera(
-        intrinsics=(560.0, 560.0, *center_px), width=width, height=height
-    )
+    size = dict(zip(("width", "height"), size_px, strict=True))
+    camera = forward_camera(intrinsics=(560.0, 560.0, *center_px), **size)
     if is_fine:
         camera.require_view_ahead("cam.yml")
         return
-    message = (
-        r"cam\.yml: principal point .*, .* in an image of \d+ x \d+ pixels, expected"
-    )
+    message = r"cam\.yml: principal point .*, .* in an image of \d+ x \d+ pixels, exp"
     with pytest.raises(DataError, match=message):
         camera.require_centered("cam.yml")
     with pytest.raises(DataError, match=message):

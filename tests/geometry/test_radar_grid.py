@@ -61,9 +61,8 @@ def test_kradar_axes():
     expected = [[0, 118.037109], [-1.932591, 1.872198], [-53, 53], [-18, 18]]
     found = [axis[[0, -1]] for axis in ends]
     np.testing.assert_allclose(found, expected, atol=1e-5)
-    small = RadarGrid.reduced(
-        num_doppler=1, num_range=64, num_elevation=9, num_azimuth=56
-    )
+    sizes = {"num_range": 64, "num_elevation": 9, "num_azimuth": 56}
+    small = RadarGrid.reduced(num_doppler=1, **sizes)
     assert small.shape_drea == (1, 64, 9, 56)
     assert (small.range_m[-1], small.doppler_mps.tolist()) == (118.0, [0])
     np.testing.assert_allclose(np.rad2deg(small.azimuth_rad[[0, -1]]), [-53, 53])
@@ -74,10 +73,9 @@ def test_straight_ahead_and_left_by_hand():
     # Bin 53 is boresight; one bin left of it is -1 degree, y positive.
     ahead = KRADAR.bin_to_ego(100, 53)
     np.testing.assert_allclose(ahead, [46.2890625, 0.0], atol=1e-12)
-    left = KRADAR.bin_to_ego(100, 52)
-    np.testing.assert_allclose(
-        left, 46.2890625 * np.array([np.cos(np.pi / 180), np.sin(np.pi / 180)])
-    )
+    left, degree = KRADAR.bin_to_ego(100, 52), np.pi / 180
+    expected = 46.2890625 * np.array([np.cos(degree), np.sin(degree)])
+    np.testing.assert_allclose(left, expected)
     assert KRADAR.nearest_bin(*left).tolist() == [100, 52]
 
 
@@ -87,9 +85,8 @@ def test_padding_keeps_bins_in_place_unless_stretched():
     np.testing.assert_allclose(padded.azimuth_rad[:107], KRADAR.azimuth_rad, atol=1e-12)
     np.testing.assert_allclose(np.rad2deg(padded.azimuth_rad[-1]), 58.0)
     stretched = KRADAR.padded(8, "stretched")
-    np.testing.assert_allclose(
-        np.rad2deg(stretched.azimuth_rad), -53 + np.arange(112) * 106 / 111
-    )
+    expected = np.linspace(-53, 53, 112)
+    np.testing.assert_allclose(np.rad2deg(stretched.azimuth_rad), expected)
     np.testing.assert_allclose(stretched.range_m, np.arange(256) * 118 / 255)
     uneven = UNEVEN.padded(8)
     assert (uneven.num_range, uneven.num_azimuth) == (32, 48)
@@ -200,9 +197,8 @@ def test_positions_between_bins_by_hand():
 def test_an_absent_axis_has_one_bin_in_tesseracts_and_no_channel():
     assert UNEVEN.shape_drea == (8, 30, 1, 41)
     assert UNEVEN.projection_shape == (30, 41, 8)
-    flat = dataclasses.replace(
-        UNEVEN, elevation_rad=np.array([0.1, 0.2]), doppler_mps=np.array([])
-    )
+    axes = {"elevation_rad": np.array([0.1, 0.2]), "doppler_mps": np.array([])}
+    flat = dataclasses.replace(UNEVEN, **axes)
     assert flat.shape_drea == (1, 30, 2, 41)
     projection = np.arange(3.0)
     assert flat.measured_channels(projection).tolist() == [1.0, 2.0]

@@ -1,15 +1,12 @@
-"""Makes `models_radenet.npz`: RADE-Net at small widths, computed by PyTorch.
+"""Weights and inputs of `models_radenet.npz`: RADE-Net at small widths, computed by PyTorch.
 
-    python tests/golden/models_radenet.py
-
-Needs torch (2.13.0 made the file) and `benchmarks/torch_radenet.py`, whose network was
-checked against the released one's outputs. Weights and inputs follow from names and
+This file of commit a8ba2f18 made it, with torch 2.13.0 and `benchmarks/torch_radenet.py`, whose
+network was checked against the released one's outputs. Weights and inputs follow from names and
 shapes (`seeded_tensor`), so the file holds outputs and gradients only. Reached by
 radejax in float32 on a CPU: 5e-6 on maps, 1e-5 of the largest value on gradients.
 """
 
 import pathlib
-import sys
 
 import numpy as np
 
@@ -82,41 +79,3 @@ def cotangents(shapes):
     """What outputs of these shapes are multiplied with before they are summed."""
     rng = np.random.default_rng(SEED + 1)
     return [rng.standard_normal(shape).astype(np.float32) for shape in shapes]
-
-
-def _channels_last(tensor):
-    return tensor.detach().permute(0, 2, 3, 1).numpy()
-
-
-def main():
-    sys.path.insert(0, str(HERE.parents[1] / "benchmarks"))
-    import torch
-    import torch_radenet
-
-    x = small_input()
-    x = np.pad(x, ((0, 0), (0, -x.shape[1] % 8), (0, -x.shape[2] % 8), (0, 0)))
-    x = torch.tensor(x.transpose(0, 3, 1, 2).copy())
-    arrays = {}
-    for variant, changes in VARIANTS.items():
-        model = torch_radenet.RadeNet(SMALL | changes)
-        shapes = {n: tuple(v.shape) for n, v in model.state_dict().items()}
-        state = {n: torch.tensor(v) for n, v in seeded_state(shapes).items()}
-        model.load_state_dict(state)
-        outputs = model(x)
-        maps = [_channels_last(output) for output in outputs]
-        for name, values in zip(("heatmap_logits", "box_params"), maps, strict=True):
-            arrays[f"{variant}/{name}"] = values[:, ::ROW_STEP]
-        weights = [
-            torch.tensor(c.transpose(0, 3, 1, 2).copy())
-            for c in cotangents([m.shape for m in maps])
-        ]
-        sum((o * w).sum() for o, w in zip(outputs, weights, strict=True)).backward()
-        parameters = dict(model.named_parameters())
-        for name in GRADIENTS:
-            if variant == "model":
-                arrays[f"{variant}/grad/{name}"] = parameters[name].grad.numpy()
-    np.savez_compressed(HERE / "models_radenet.npz", **arrays)
-
-
-if __name__ == "__main__":
-    main()

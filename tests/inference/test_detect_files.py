@@ -29,8 +29,6 @@ from radejax.inference.detect_files import (
 )
 from radejax.inference.detector import Detector
 from radejax.models.options import DinoRadeOptions, ImageOptions
-from radejax.simulation.config import SimulationOptions
-from radejax.simulation.dataset import simulate_dataset
 
 from .. import small_models as small
 
@@ -69,39 +67,30 @@ def test_every_format_has_the_same_boxes(tmp_path):
     inputs = find_inputs(detector, [tmp_path / "data"])
     assert inputs.keys == keys
     expected = detector(frames).to_list()
-    for file_format in ("json", "kitti", "csv"):
-        out = tmp_path / file_format
-        count, failed = detect_files(
-            detector, inputs, out, batch_size=2, file_format=file_format
-        )
-        clipped = int(detector(frames).to_boxes().is_clipped.sum())
-        num_boxes = sum(map(len, expected))
-        truncated = int(detector(frames).num_truncated.sum())
-        wanted = {"boxes": num_boxes, "clipped": clipped, "truncated": truncated}
-        assert count == {"frames": 3, "done": 0, **wanted}
-        assert truncated > 0
-        assert failed == {}
-    rows = [
-        {"frame": key, **box}
-        for key, boxes in zip(keys, expected, strict=True)
-        for box in boxes
-    ]
-    files_of_frames = sorted((tmp_path / "json").glob("7_*.json"))
-    assert [path.name for path in files_of_frames] == [
-        f"7_0000{i}.json" for i in range(3)
-    ]
-    assert [
-        row for path in files_of_frames for row in json.loads(path.read_text())
-    ] == rows
+    counts = {
+        "frames": 3,
+        "done": 0,
+        "boxes": sum(map(len, expected)),
+        "clipped": detector(frames).to_boxes().is_clipped.sum(),
+        "truncated": detector(frames).num_truncated.sum(),
+    }
+    assert counts["truncated"] > 0
+    for kind in ("json", "kitti", "csv"):
+        options = {"batch_size": 2, "file_format": kind}
+        found = detect_files(detector, inputs, tmp_path / kind, **options)
+        assert found == (counts, {})
+    rows = []
+    for key, boxes in zip(keys, expected, strict=True):
+        path = tmp_path / "json" / f"{key.replace('/', '_')}.json"
+        rows += [{"frame": key, **box} for box in boxes]
+        assert json.loads(path.read_text()) == rows[-len(boxes) :]
+    assert len(list((tmp_path / "json").glob("7_*.json"))) == 3
     with open(tmp_path / "csv" / "boxes.csv", encoding="utf-8") as file:
         table = list(csv.DictReader(file))
     assert table == [{name: str(x) for name, x in row.items()} for row in rows]
     # Either is scored against labels whose frames have the key of both sensors.
-    table = {
-        "frame": [4, 5],
-        "sequence": [7, 7],
-        "name": ["00002_00011", "00001_00010"],
-    }
+    names = ["00002_00011", "00001_00010"]
+    table = {"frame": [4, 5], "sequence": [7, 7], "name": names}
     files.write_json(tmp_path / "truth.json", [])
     files.write_json(tmp_path / "frames.json", table)
     source = Source(ground_truth=str(tmp_path / "truth.json"))
@@ -165,11 +154,7 @@ def test_a_frame_with_a_box_that_is_not_finite_fails(
 
 @pytest.mark.parametrize(
     ("kind", "lost", "done"),
-    [
-        ("json", ["7_00001.json"], 2),
-        ("kitti", ["preds/000001.txt"], 2),
-        ("csv", [], 0),
-    ],
+    [("json", ["7_00001.json"], 2), ("kitti", ["preds/000001.txt"], 2), ("csv", [], 0)],
 )
 def test_a_file_that_cannot_be_read_fails_alone_and_a_second_call_continues(
     detected, tmp_path, kind, lost, done
@@ -191,6 +176,12 @@ def test_a_file_that_cannot_be_read_fails_alone_and_a_second_call_continues(
     assert _texts(out) == expected
 
 
+def _check_scores(paths, expected):
+    for path, boxes in zip(sorted(paths), expected, strict=True):
+        scores = [box["score"] for box in json.loads(path.read_text())]
+        assert scores == pytest.approx([box["score"] for box in boxes], abs=1e-5)
+
+
 def test_an_image_that_cannot_be_read_fails_alone(tmp_path):
     detector = small.detector("camera")
     images = [tmp_path / f"{i}.png" for i in range(3)]
@@ -198,38 +189,21 @@ def test_an_image_that_cannot_be_read_fails_alone(tmp_path):
         Image.fromarray(image).save(path)
     camera = small.calibration().camera()
     frames = small.projections(3)
-    inputs = FrameInputs(
-        ["1/0", "1/1", "1/2"],
-        [None] * 3,
-        frames.__getitem__,
-        [(path, camera) for path in images],
-    )
+    keys, views = ["1/0", "1/1", "1/2"], [(path, camera) for path in images]
+    inputs = FrameInputs(keys, [None] * 3, frames.__getitem__, views)
     images[1].write_bytes(images[1].read_bytes()[:-60])
     count, failed = detect_files(detector, inputs, tmp_path / "out", batch_size=2)
     assert (count["frames"], count["radar_only"], list(failed)) == (2, 0, ["1/1"])
     expected = detector(frames[[0, 2]], small.images(3)[[0, 2]], small.calibration())
-    for name, boxes in zip("02", expected.to_list(), strict=True):
-        rows = json.loads((tmp_path / "out" / f"1_{name}.json").read_text())
-        assert [row["score"] for row in rows] == pytest.approx(
-            [box["score"] for box in boxes], abs=1e-5
-        )
+    _check_scores((tmp_path / "out").glob("1_*.json"), expected.to_list())
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (
-            "threshold",
-            r"decode\.score_threshold is 0\.1 there and 0\.3 here; choose anot",
-        ),
-        (
-            "weights",
-            r"options\.weights is '\w{16}' there and '\w{16}' here; choose anot",
-        ),
-        (
-            "frames",
-            r"options\.frames is \['7/00000', .* there and \['7/00000'\] here; ch",
-        ),
+        ("threshold", r"decode\.score_threshold is 0\.1 there and 0\.3 here; choose"),
+        ("weights", r"options\.weights is '\w{16}' there and '\w{16}' here; choose"),
+        ("frames", r"options\.frames is \['7/00000', .* there and \['7/00000'\] here;"),
         ("format", r"options\.format is 'json' there and 'kitti' here"),
         ("manifest", r"7_0000\d\.json is there, but no manifest\.json"),
     ],
@@ -310,9 +284,7 @@ def test_frames_that_failed_are_left_out_and_counted(detected, tmp_path, kind):
     assert counts == {"frames left out: `radejax detect` failed": 1}
     assert frames["frame"].tolist() == truth.frame.tolist() == [0, 2]
     assert len(left) == np.count_nonzero(found.frame != 1) < len(found)
-    with pytest.raises(
-        DataError, match="1 of 4 frames have no file, such as 7/00003_0"
-    ):
+    with pytest.raises(DataError, match="1 of 4 frames have no file, such as 7/00003_"):
         _score(detector, out, 4)
 
 
@@ -320,19 +292,15 @@ def test_preceding_frames_of_files_are_of_their_sequence(tmp_path):
     """Frames 7, 8 and 10 of a sequence, and 11 of the next one."""
     detector = small.detector(num_frames=2)
     frames = small.projections(4)
-    _write_projections(
-        tmp_path / "data", ("1/00007", "1/00008", "1/00010", "2/00011"), frames
-    )
+    keys = ("1/00007", "1/00008", "1/00010", "2/00011")
+    _write_projections(tmp_path / "data", keys, frames)
     inputs = find_inputs(detector, [tmp_path / "data"])
     expected = detector(np.stack([frames[[0, 0, 2, 3]], frames], 1)).to_list()
     for batch_size in (1, 2, 8):
         out = tmp_path / f"out{batch_size}"
         count, _ = detect_files(detector, inputs, out, batch_size=batch_size)
         assert (count["frames"], count["repeated"]) == (4, 3)
-        paths = sorted(out.glob("[12]_*.json"))
-        for path, boxes in zip(paths, expected, strict=True):
-            scores = [box["score"] for box in json.loads(path.read_text())]
-            assert scores == pytest.approx([box["score"] for box in boxes], abs=1e-5)
+        _check_scores(out.glob("[12]_*.json"), expected)
 
 
 @pytest.mark.parametrize(
@@ -362,9 +330,7 @@ def test_a_frame_after_one_that_cannot_be_read_has_no_preceding_one(tmp_path):
         out = tmp_path / f"out{batch_size}"
         count, failed = detect_files(detector, inputs, out, batch_size=batch_size)
         assert (count["frames"], count["repeated"], [*failed]) == (3, 2, [keys[1]])
-        for path, boxes in zip(sorted(out.glob("1_*")), expected, strict=True):
-            scores = [box["score"] for box in json.loads(path.read_text())]
-            assert scores == pytest.approx([box["score"] for box in boxes], abs=1e-5)
+        _check_scores(out.glob("1_*.json"), expected)
         inputs.paths[1].write_bytes(content)
         for counts in ((4, 0, 1), (0, 4, 0)):  # the whole part, then nothing
             count, _ = detect_files(detector, inputs, out, batch_size=batch_size)
@@ -382,10 +348,8 @@ def test_two_frames_of_one_name_are_rejected(tmp_path):
 
 def test_images_of_simulated_folders_are_found(tmp_path):
     """Their labels are in `info_label_v2_1`."""
-    options = SimulationOptions(
-        output="projection", train_sequences=1, test_sequences=0, frames_per_sequence=1
-    )
-    root = simulate_dataset(options, tmp_path / "data", progress=False)
+    sizes = {"train_sequences": 1, "test_sequences": 0, "frames_per_sequence": 1}
+    root = small.simulate(tmp_path / "data", **sizes)
     (path,) = find_frames([root])
     detector = SimpleNamespace(
         model=models.build(DinoRadeOptions(image=ImageOptions(size=(180, 320)))),
@@ -411,9 +375,7 @@ def test_images_of_simulated_folders_are_found(tmp_path):
 
     # K-Radar's disks have no camera calibration; its repository does.
     folder = (root / "calib").rename(tmp_path / "repository")
-    with pytest.raises(
-        UserError, match=r"1 no camera calib.*--camera-calibration FOLD"
-    ):
+    with pytest.raises(UserError, match=r"1 no camera calib.*--camera-calibration"):
         front_images([path], detector)
     known = front_images([path], detector, camera_calibration=folder)
     np.testing.assert_array_equal(known[found][1].intrinsics, camera.intrinsics)

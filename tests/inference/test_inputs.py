@@ -7,11 +7,8 @@ import pytest
 from radejax import Detector, UserError
 from radejax.core.structures import Batch
 from radejax.data.options import CameraOptions, DataOptions
-from radejax.geometry.camera import (
-    KRADAR_RADAR_FROM_LIDAR_Z_M,
-    RADAR_FROM_LIDAR_M,
-    stack_cameras,
-)
+from radejax.geometry import camera as camera_lib
+from radejax.geometry.camera import stack_cameras
 from radejax.inference.inputs import InputReader
 
 from .. import small_models as small
@@ -40,27 +37,19 @@ def _differs(a, b):
 def test_every_form_of_a_camera_gives_the_same(fusion, tmp_path):
     projection, image = small.projections(2), small.images(2)
     # A path says nothing about the radar's place: it has K-Radar's.
-    shift = (*RADAR_FROM_LIDAR_M[:2], KRADAR_RADAR_FROM_LIDAR_Z_M)
+    ground = camera_lib.RADAR_FROM_LIDAR_M[:2]
+    shift = (*ground, camera_lib.KRADAR_RADAR_FROM_LIDAR_Z_M)
     calibration = small.calibration(radar_from_lidar_m=shift)
     path = tmp_path / "cam_front0.yml"
     path.write_text(calibration.to_kradar_text())
     camera = calibration.camera("raw")
     expected = fusion(projection, image, calibration)
-    for given in (
-        path,
-        [calibration, path],
-        camera,
-        [camera, calibration],
-        stack_cameras([camera, camera]),
-    ):
+    stacked = stack_cameras([camera, camera])
+    for given in (path, [calibration, path], camera, [camera, calibration], stacked):
         _equal(fusion(projection, image, given), expected)
-    _equal(
-        fusion(projection[0], image[0], camera),
-        fusion(projection[:1], image[:1], camera),
-    )
-    batch = Batch(
-        projection, None, None, None, None, image, stack_cameras([camera] * 2)
-    )
+    one = fusion(projection[:1], image[:1], camera)
+    _equal(fusion(projection[0], image[0], camera), one)
+    batch = Batch(projection, None, None, None, None, image, stacked)
     _equal(fusion(batch), expected)
     assert _differs(fusion(projection, image[::-1], calibration), expected)
     turned = small.calibration(yaw_deg=70.0, radar_from_lidar_m=shift)
@@ -102,9 +91,7 @@ def test_embedded_images_and_weights_without_the_backbone(fusion):
     _equal(fusion(projection, features, small.calibration()), expected)
     lean = fusion.replace(variables=_without_backbone(fusion.variables))
     _equal(lean(projection, features, small.calibration()), expected)
-    with pytest.raises(
-        UserError, match="without the image backbone: give image_backbone"
-    ):
+    with pytest.raises(UserError, match="without the image backbone: give"):
         lean(projection, image, small.calibration())
     with pytest.raises(UserError, match="without the image backbone"):
         lean(Batch(projection, None, None, None, None, image))

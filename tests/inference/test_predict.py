@@ -17,8 +17,6 @@ from radejax.inference.saved import SavedModel
 from radejax.losses.detection import detection_loss
 from radejax.runs.data import Data
 from radejax.runs.evaluate import Evaluation
-from radejax.simulation.config import SimulationOptions
-from radejax.simulation.dataset import simulate_dataset
 
 from .. import small_models as small
 
@@ -29,8 +27,7 @@ def setup(tmp_path_factory):
     folder = tmp_path_factory.mktemp("predict")
     grid = {"num_doppler": 2, "num_range": 32, "num_elevation": 3, "num_azimuth": 28}
     counts = {"train_sequences": 0, "test_sequences": 1, "frames_per_sequence": 5}
-    simulation = SimulationOptions(**counts).replace(grid=grid)
-    root = simulate_dataset(simulation, folder / "data", progress=False)
+    root = small.simulate(folder / "data", **counts, grid=grid, output="tesseract")
     config = small.radar_config().replace(
         data={"roots": (str(root),), "records": str(folder / "records")},
         evaluation={"score_threshold": 0.45, "batch_size": 3},
@@ -41,24 +38,15 @@ def setup(tmp_path_factory):
     preprocess(data.frames, folder / "records", num_workers=0, progress=False)
     records = data.records
     variables = small.drawn(model, np.zeros((1, *records.grid.projection_shape)))
-    return SimpleNamespace(
-        config=config,
-        model=model,
-        data=data,
-        frames=data.split("test"),
-        records=records,
-        variables=variables,
-    )
+    made = SimpleNamespace(config=config, model=model, variables=variables)
+    made.data, made.records, made.frames = data, records, data.split("test")
+    return made
 
 
 def _predict(setup, num_devices):
     mesh = devices.make_mesh(num_devices)
     evaluation = Evaluation(setup.config, setup.data, mesh=mesh)
     return evaluation.predict(setup.variables, progress=False)
-
-
-def _saved(setup):
-    return SavedModel(setup.config, setup.records.grid, setup.variables)
 
 
 def _assert_same(actual, expected):
@@ -73,7 +61,8 @@ def test_eight_devices_and_a_detector_predict_the_same_as_one(setup):
     assert set(expected.frame) == set(range(5))
     assert len(expected) > 50
     _assert_same(_predict(setup, 8), expected)
-    detector = Detector(_saved(setup), score_threshold=0.45)
+    saved = SavedModel(setup.config, setup.records.grid, setup.variables)
+    detector = Detector(saved, score_threshold=0.45)
     alone = predict_dataset(detector, setup.records, setup.frames, 3, progress=False)
     _assert_same(alone, expected)
 
@@ -91,9 +80,7 @@ def test_scores_during_training_name_their_protocol(setup):
     # The loss of eight devices is the mean of the losses of single frames.
     table = make_table(setup.records, setup.frames, max_objects=30)
     one_by_one = LoaderOptions(1, shuffle=False, num_epochs=1, num_threads=0)
-    grid = models.map_grid(
-        setup.records.grid, setup.model, setup.config.data.azimuth_mapping
-    )
+    grid = models.map_grid(setup.records.grid, setup.model, "true")
     names = ("focal", "gwd", "weighted_sum")
 
     @jax.jit
@@ -102,9 +89,8 @@ def test_scores_during_training_name_their_protocol(setup):
         terms = detection_loss(maps, batch, grid, setup.config.loss)[1]
         return jnp.stack([terms[name] for name in names])
 
-    expected = [
-        terms_of(setup.variables, batch) for batch in make_loader(table, one_by_one)
-    ]
+    batches = make_loader(table, one_by_one)
+    expected = [terms_of(setup.variables, batch) for batch in batches]
     found = [scores.values[f"test/{name}"] for name in names]
     np.testing.assert_allclose(found, np.mean(expected, 0), rtol=1e-4)
     assert scores.values["test/loss"] == pytest.approx(4.0)

@@ -20,9 +20,8 @@ def plain_samples(value, sizes, locations, weights):
         y = locations[..., level, :, 1, None] * height - 0.5 - jnp.arange(height)
         x, y = (jnp.maximum(1 - jnp.abs(v), 0) for v in (x, y))
         share = weights[..., level, :, None] * y
-        out += jnp.einsum(
-            "bqkpy,bqkpx,byxkd->bqkd", share, x, grid, precision="highest"
-        )
+        sums = "bqkpy,bqkpx,byxkd->bqkd"
+        out += jnp.einsum(sums, share, x, grid, precision="highest")
     return out.reshape(*out.shape[:2], -1)
 
 

@@ -35,14 +35,10 @@ def test_outputs_and_gradients_equal_those_of_plain_convolution(
 
     def plain(x, kernel):
         p = dilation * (size // 2)
-        return jax.lax.conv_general_dilated(
-            x,
-            kernel,
-            (1, 1),
-            ((p, p), (p, p)),
-            rhs_dilation=(dilation, dilation),
-            dimension_numbers=("NHWC", "HWIO", "NHWC"),
-        )
+        options = {"rhs_dilation": (dilation, dilation)}
+        options["dimension_numbers"] = ("NHWC", "HWIO", "NHWC")
+        padding = ((p, p), (p, p))
+        return jax.lax.conv_general_dilated(x, kernel, (1, 1), padding, **options)
 
     def run(convolve):
         def both(x, kernel):
@@ -62,6 +58,5 @@ def test_blocked_kernel_gradient_accumulates_bfloat16_in_float32():
     assert actual.dtype == jnp.bfloat16
     wide = [v.astype(jnp.float32) for v in ours]
     expected = blocked_kernel_gradient(*wide, size=3, dilation=1)
-    np.testing.assert_allclose(
-        actual.astype(jnp.float32), expected, rtol=5e-3, atol=1e-2
-    )
+    actual = actual.astype(jnp.float32)
+    np.testing.assert_allclose(actual, expected, rtol=5e-3, atol=1e-2)

@@ -9,11 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.models.deformable_attention import (
-    DeformableAttention,
-    Queries,
-    lifted_attention,
-)
+from radejax.models import deformable_attention as attention
+from radejax.models.deformable_attention import DeformableAttention
 
 from .plain_attention import plain_attention
 
@@ -51,11 +48,11 @@ def test_samples_by_hand():
         (np.nan, np.nan): 0.0,
     }
     n = len(places)
-    out = lifted_attention(
+    out = attention.lifted_attention(
         value.reshape(1, 2, 3, 1, 1),
         jnp.zeros((1, n, 1, 1, 2)),
         jnp.zeros((1, n, 1, 1)),
-        Queries(
+        attention.Queries(
             jnp.ones((1, n, 1)),
             jnp.asarray(list(places)).reshape(1, n, 1, 2),
             jnp.full((1, n, 1), 2.0),
@@ -185,13 +182,12 @@ def test_lifted_form_equals_the_plain_one(shared_geometry):
             out, pull = jax.vjp(lambda *a: form(module, *a), params, inputs)
             return out, pull(cotangent)
 
-        results = [
-            jax.jit(run, static_argnums=0)(form, params, inputs, cotangent)
-            for form in (through_plain_form, through_lifted_form)
-        ]
-        chex.assert_trees_all_close(results[1], results[0], rtol=0, atol=1e-11)
+        compiled = jax.jit(run, static_argnums=0)
+        plain = compiled(through_plain_form, params, inputs, cotangent)
+        lifted = compiled(through_lifted_form, params, inputs, cotangent)
+        chex.assert_trees_all_close(lifted, plain, rtol=0, atol=1e-11)
         # So that the comparison means something: every gradient is at work.
-        sizes = jax.tree.map(lambda g: float(jnp.abs(g).max()), results[0][1])
+        sizes = jax.tree.map(lambda g: float(jnp.abs(g).max()), plain[1])
         assert min(jax.tree.leaves(sizes)) > 0.1
 
 

@@ -37,15 +37,12 @@ def references(model, camera, num_range=8):
 
 def batch(*, valid=(True, True), yaws=(90.0, 80.0)):
     rng = np.random.default_rng(0)
-    cameras = [
-        calibration(yaw_deg=yaw).camera(is_valid=ok)
-        for yaw, ok in zip(yaws, valid, strict=True)
-    ]
-    return (
-        jnp.asarray(rng.random((B, R, A, 5)), jnp.float32),
-        jnp.asarray(rng.integers(0, 256, (B, *SIZE, 3)), jnp.uint8),
-        stack_cameras(cameras),
-    )
+    calibrations = [calibration(yaw_deg=yaw) for yaw in yaws]
+    views = zip(calibrations, valid, strict=True)
+    camera = stack_cameras([one.camera(is_valid=ok) for one, ok in views])
+    projection = jnp.asarray(rng.random((B, R, A, 5)), jnp.float32)
+    image = jnp.asarray(rng.integers(0, 256, (B, *SIZE, 3)), jnp.uint8)
+    return projection, image, camera
 
 
 @functools.cache

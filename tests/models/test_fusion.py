@@ -15,9 +15,8 @@ from radejax.models.options import FusionOptions
 from .plain_attention import plain_attention
 
 B, R, A, C, E, D, H, W = 2, 4, 3, 8, 3, 5, 6, 7
-SMALL = FusionOptions(
-    num_heads=2, num_points=3, num_elevation=E, necks=False, chunk_size=5
-)
+SIZES = {"num_heads": 2, "num_points": 3, "num_elevation": E, "chunk_size": 5}
+SMALL = FusionOptions(necks=False, **SIZES)
 
 
 def fusion(**changes):
@@ -31,9 +30,8 @@ def inputs(seed=0, batch_geometry=True):
     is_valid[:, 1, 1] = False  # a bin that sees nothing
     is_valid[:, 0, 0] = True
     normal = lambda *s: rng.standard_normal(s).astype(np.float32)  # noqa: E731
-    reference = ReferencePoints(
-        points=rng.random((n, R, A, E, 2)).astype(np.float32), is_valid=is_valid
-    )
+    points = rng.random((n, R, A, E, 2)).astype(np.float32)
+    reference = ReferencePoints(points, is_valid)
     maps = normal(B, R, A, C), rng.random((B, R, A, D)), normal(B, H, W, C)
     return (*map(jnp.asarray, maps), reference)
 
@@ -98,9 +96,8 @@ def test_fusion_follows_the_equations(weighting, gate, out_of_view, batch_geomet
     args = inputs(batch_geometry=batch_geometry)
     variables = variables_of(module, args)
     fused = jax.jit(module.apply)(variables, *args)
-    np.testing.assert_allclose(
-        fused, by_the_formulas(module, variables, *args), atol=2e-5
-    )
+    expected = by_the_formulas(module, variables, *args)
+    np.testing.assert_allclose(fused, expected, atol=2e-5)
     gate_width = C if gate == "channel" else 1
     assert variables["params"]["gate_out"]["bias"].shape == (gate_width,)
 

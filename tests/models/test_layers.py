@@ -5,12 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.models.layers import (
-    Conv,
-    Dense,
-    GroupNorm,
-    Upsample,
-)
+from radejax.models.layers import Conv, Dense, GroupNorm, Upsample
 
 
 @pytest.mark.parametrize("offset", [0.0, 1000.0])

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.geometry.camera import CameraCalibration, stack_cameras
+from radejax.geometry.camera import stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models import lifting
 from radejax.models.lifting import WeightingNetwork
@@ -14,16 +14,8 @@ from radejax.models.options import QueryGridOptions
 
 from .. import small_models as small
 
-AXES = QueryGridOptions(
-    range_m=(1.0, 4.0), azimuth_deg=(-40.0, 20.0), elevation_deg=(-10.0, 10.0)
-)
-
-
-def ahead(**fields) -> CameraCalibration:
-    """A camera of 100 x 80 pixels in the radar's place, looking along x."""
-    settings = {"intrinsics": (50.0, 50.0, 50.0, 40.0), "width": 100, "height": 80}
-    settings["radar_from_lidar_m"] = (0.0, 0.0, 0.0)
-    return small.calibration(**(settings | fields))
+ANGLES = {"azimuth_deg": (-40.0, 20.0), "elevation_deg": (-10.0, 10.0)}
+AXES = QueryGridOptions(range_m=(1.0, 4.0), **ANGLES)
 
 
 def test_centers_by_hand():
@@ -60,12 +52,10 @@ def test_uneven_axes_are_given_by_all_centers_and_continue_into_padding():
 
 
 def check_official(reference, index, points, is_valid):
-    np.testing.assert_allclose(
-        np.asarray(reference.points).reshape(-1, 2)[index], points, atol=2e-6
-    )
-    np.testing.assert_array_equal(
-        np.asarray(reference.is_valid).reshape(-1)[index], is_valid
-    )
+    found = np.asarray(reference.points).reshape(-1, 2)[index]
+    np.testing.assert_allclose(found, points, atol=2e-6)
+    found = np.asarray(reference.is_valid).ravel()[index]
+    np.testing.assert_array_equal(found, is_valid)
 
 
 def test_released_reference_points(golden, released):
@@ -86,18 +76,17 @@ def test_released_reference_points(golden, released):
     assert whole.is_valid.mean() == pytest.approx(0.953, abs=5e-4)
     # In the program, in float32, for two cameras.
     cameras = stack_cameras([camera] * 2)
-    in_program = jax.jit(
-        lambda c: lifting.reference_points(c, axes, 256, 112, 10, "official")
-    )(jax.tree.map(jnp.asarray, cameras))
+    project = jax.jit(lifting.reference_points, static_argnums=range(1, 6))
+    cameras = jax.tree.map(jnp.asarray, cameras)
+    in_program = project(cameras, axes, 256, 112, 10, "official")
     second = jax.tree.map(lambda x: x[1], in_program)
     check_official(second, file["index"], file["reference_points_f64"], file["valid"])
 
 
 def test_queries_outside_the_image_are_invalid_and_clipped():
-    axes = QueryGridOptions(
-        range_m=(10.0, 10.0), azimuth_deg=(-60.0, 60.0), elevation_deg=(-1.0, 1.0)
-    )
-    calibration = ahead()
+    angles = {"azimuth_deg": (-60.0, 60.0), "elevation_deg": (-1.0, 1.0)}
+    axes = QueryGridOptions(range_m=(10.0, 10.0), **angles)
+    calibration = small.forward_camera()
     reference = lifting.reference_points(calibration.camera(), axes, 2, 5, 1)
     # Azimuth -60, 0, 60, 120, 180 degrees: left of the image, in it, right, behind.
     assert reference.is_valid[0, 1, :, 0].tolist() == [False, True] + 3 * [False]
@@ -110,7 +99,8 @@ def test_queries_outside_the_image_are_invalid_and_clipped():
 
 
 def test_a_camera_of_zeros_sees_nothing():
-    zeros = stack_cameras([jax.tree.map(lambda x: 0 * x, ahead().camera())] * 2)
+    ahead = stack_cameras([small.forward_camera().camera()] * 2)
+    zeros = jax.tree.map(lambda x: 0 * x, ahead)
     for camera in (zeros, jax.tree.map(jnp.asarray, zeros)):
         with np.errstate(invalid="ignore", divide="ignore"):
             reference = lifting.reference_points(camera, AXES, 3, 4, 2)

@@ -52,9 +52,8 @@ def test_center_and_scale_are_those_of_the_input(small, variables, apply):
     noise = x.astype(jnp.bfloat16).astype(jnp.float32) - x
     assert jnp.abs(noise).max() > 1e-3  # what a cast before it would lose
     seen = narrow.apply(variables, x, method="_padded")
-    np.testing.assert_allclose(
-        seen[:, :21, :14].astype(np.float32), (x - 0.545) * 25.0, rtol=2**-8
-    )
+    seen = seen[:, :21, :14].astype(np.float32)
+    np.testing.assert_allclose(seen, (x - 0.545) * 25.0, rtol=2**-8)
 
 
 def test_a_turned_scene_gives_turned_boxes():
@@ -105,8 +104,6 @@ def test_bfloat16_is_near_float32(small, variables, apply):
     narrow = models.build(small.replace(dtype="bfloat16"))
     maps, expected = jax.jit(narrow.apply)(variables, x), apply(variables, x)
     assert maps.heatmap_logits.dtype == maps.box_params.dtype == jnp.float32
-    for actual, wide in zip(
-        jax.tree.leaves(maps), jax.tree.leaves(expected), strict=True
-    ):
+    for actual, wide in zip(*map(jax.tree.leaves, (maps, expected)), strict=True):
         assert np.abs(actual - wide).max() > 0  # it did compute in bfloat16
         assert np.abs(actual - wide).max() < 0.1 * np.abs(wide).max()

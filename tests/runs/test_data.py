@@ -4,7 +4,6 @@ import pathlib
 import re
 import shutil
 from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
@@ -13,27 +12,25 @@ from radejax.config import Config
 from radejax.core.errors import UserError
 from radejax.data.kradar import KRadar
 from radejax.runs import data as run_data
-from radejax.runs.data import Data, data_of_run, located, open_data
+from radejax.runs.data import data_of_run, located, open_data
 from radejax.simulation.config import SimulationOptions
-from radejax.simulation.dataset import simulate_dataset
 
-SMALL = SimulationOptions(train_sequences=2, test_sequences=1)
+from .. import small_models as small
 
 
 @pytest.fixture(scope="module")
-def simulated(tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+def simulated(tmp_path_factory):
     """Sequences 1 and 2 of the train split, 3 of the test split, of two frames."""
-    simulation = SMALL.replace(output="projection", frames_per_sequence=2)
-    root = tmp_path_factory.mktemp("simulated") / "sim"
-    return simulate_dataset(simulation, root, progress=False)
+    sizes = {"train_sequences": 2, "test_sequences": 1, "frames_per_sequence": 2}
+    return small.simulate(tmp_path_factory.mktemp("simulated") / "sim", **sizes)
 
 
 @pytest.fixture
-def root(simulated: pathlib.Path, tmp_path: pathlib.Path) -> pathlib.Path:
+def root(simulated, tmp_path):
     return pathlib.Path(shutil.copytree(simulated, tmp_path / "sim"))
 
 
-def _config(*roots: object, batch_size: int = 1, **fields: Any) -> Config:
+def _config(*roots, batch_size=1, **fields):
     return Config().replace(
         model={"doppler_bins": 16, "elevation_bins": 9},
         train={"batch_size": batch_size},
@@ -41,16 +38,16 @@ def _config(*roots: object, batch_size: int = 1, **fields: Any) -> Config:
     )
 
 
-def _open(config: Config) -> Data:
+def _open(config):
     return open_data(located(config))
 
 
-def test_without_data_and_simulation_the_flag_is_named() -> None:
+def test_without_data_and_simulation_the_flag_is_named():
     with pytest.raises(UserError, match=r"give --data ROOT"):
         located(Config())
 
 
-def test_a_missing_folder_is_named(tmp_path: pathlib.Path) -> None:
+def test_a_missing_folder_is_named(tmp_path):
     nowhere = str(tmp_path / "nowhere")
     names = ("labels", "embeddings", "image_backbone", "camera_calibration")
     configs = [_config(tmp_path, **{name: nowhere}) for name in names]
@@ -60,8 +57,8 @@ def test_a_missing_folder_is_named(tmp_path: pathlib.Path) -> None:
 
 
 def test_paths_are_absolute_and_simulations_named_by_their_config(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "v2.zip").touch()
     config = _config(labels="v2.zip").replace(simulation=SimulationOptions())
@@ -75,23 +72,14 @@ def test_paths_are_absolute_and_simulations_named_by_their_config(
         located(config.replace(data={"roots": ("a", "b")}))
 
 
-def test_frames_are_projected_beside_their_data_once(
-    root: pathlib.Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_frames_are_projected_beside_their_data_once(root, monkeypatch, capsys, caplog):
     monkeypatch.chdir(root.parent)
+    bins = _config("sim").replace(model={"doppler_bins": 64})
+    nothing = _config("sim", batch_size=4, visibility=())
     for wrong, message in (
-        (
-            _config("sim").replace(model={"doppler_bins": 64}),
-            "doppler_bins is 64, expected 16, as the rad",
-        ),
+        (bins, "doppler_bins is 64, expected 16, as the rad"),
         (_config("sim", batch_size=5), "4 frames are fewer than one batch"),
-        (
-            _config("sim", batch_size=4, visibility=()),
-            "4 frames of the train split have no object of",
-        ),
+        (nothing, "4 frames of the train split have no object of"),
     ):
         with pytest.raises(UserError, match=message):
             _open(wrong)
@@ -99,16 +87,15 @@ def test_frames_are_projected_beside_their_data_once(
     config = _config("sim", batch_size=4)
     with caplog.at_level("INFO", "radejax"):
         data = _open(config)
-        assert re.search(
-            r"input: 0\.64\d ± 0\.04\d in the frames to train", caplog.text
-        )
+        text = r"input: 0\.64\d ± 0\.04\d in the frames to train"
+        assert re.search(text, caplog.text)
         assert "the network sees" not in caplog.text
     assert data.options.roots == (str(root),)
     assert data.options.records == str(root / "records")
     assert len(data.records.keys()) == 6
     assert len(data.split("test")) == 2
 
-    def written() -> dict[pathlib.Path, int]:
+    def written():
         return {p: p.stat().st_mtime_ns for p in (root / "records").rglob("*.npy")}
 
     before = written()
@@ -118,9 +105,7 @@ def test_frames_are_projected_beside_their_data_once(
     assert written() == before
 
 
-def test_frames_of_the_splits_without_labels_are_counted(
-    root: pathlib.Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_frames_of_the_splits_without_labels_are_counted(root, caplog):
     min(root.glob("1/info_label_v2_1/*")).unlink()
     shutil.rmtree(root / "3" / "info_label_v2_1")
     with caplog.at_level("INFO", "radejax"):
@@ -130,9 +115,7 @@ def test_frames_of_the_splits_without_labels_are_counted(
     assert "split entries of sequences that are not here: 2" in caplog.text
 
 
-def test_frames_without_a_radar_tensor_that_can_be_read_are_left_out(
-    root: pathlib.Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_frames_without_a_radar_tensor_that_can_be_read_are_left_out(root, caplog):
     corrupted = next(frame for frame in KRadar(root) if frame.sequence == 1)
     corrupted.projection_path.write_bytes(b"half")
     with caplog.at_level("WARNING", "radejax"):
@@ -145,15 +128,12 @@ def test_frames_without_a_radar_tensor_that_can_be_read_are_left_out(
 
 
 def test_a_run_is_evaluated_on_its_part_or_on_all_of_other_folders(
-    root: pathlib.Path,
-    tmp_path: pathlib.Path,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+    root, tmp_path, monkeypatch, caplog
+):
     frames, copy = KRadar(root), str(shutil.copytree(root, tmp_path / "copy"))
     given = str(tmp_path / "copy")  # any folder that exists
     own = located(_config(root, sequences=(1, 3), labels=given, embeddings=given))
-    saved: Any = SimpleNamespace(config=own, grid=frames.grid)
+    saved = SimpleNamespace(config=own, grid=frames.grid)
     saved.model = models.build(own.model)
     with monkeypatch.context() as patch:
         patch.setattr(run_data, "Data", lambda *_: SimpleNamespace(frames=frames))
@@ -176,9 +156,7 @@ def test_a_run_is_evaluated_on_its_part_or_on_all_of_other_folders(
         assert {frame.sequence for frame in found.frames} == expected
 
 
-def test_sequences_are_held_out_for_validation(
-    root: pathlib.Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_sequences_are_held_out_for_validation(root, caplog):
     with caplog.at_level("INFO", "radejax"):
         data = _open(_config(root, validation=(1,)))
     names = ("train", "validation", "test")

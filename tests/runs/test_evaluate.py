@@ -3,9 +3,8 @@
 import dataclasses
 import json
 import pathlib
-from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -22,27 +21,25 @@ from radejax.geometry.radar_grid import RadarGrid
 from radejax.runs import evaluate
 from radejax.runs.evaluate import report_options
 
-DATA: dict[str, Any] = {
+DATA = {
     "choosing_split": "test",
     "preprocess": lambda: None,
     "input_of": lambda split: ("mean", split),
 }
 
 
-def _shuffled(paths: list[str | None], seed: int) -> list[Any]:
+def _shuffled(paths, seed):
     """Frames 0, 1, ... with images (and calibrations) of these names, shuffled."""
     blank = {field.name: None for field in dataclasses.fields(Frame)}
-    frames = [
-        Frame(
-            **blank | {"name": str(i), "camera_path": p, "camera_calibration_path": p}
-        )
-        for i, p in enumerate(paths)
-    ]
-    data: Any = SimpleNamespace(camera=True, split=lambda _: frames)
+    frames = []
+    for i, path in enumerate(paths):
+        fields = {"camera_path": path, "camera_calibration_path": path}
+        frames.append(Frame(**blank | fields | {"name": str(i)}))
+    data = SimpleNamespace(camera=True, split=lambda _: frames)
     return evaluate.with_shuffled_images(data, "test", seed)
 
 
-def test_every_frame_sees_another_ones_image() -> None:
+def test_every_frame_sees_another_ones_image():
     paths = ["a", "b", None, "c", "d", "e"]
     shuffled = _shuffled(paths, 3)
     found = [frame.camera_path for frame in shuffled]
@@ -56,24 +53,23 @@ def test_every_frame_sees_another_ones_image() -> None:
     assert any(found != other for other in again[1:])
 
 
-def test_images_of_fewer_than_two_frames_cannot_be_shuffled() -> None:
+def test_images_of_fewer_than_two_frames_cannot_be_shuffled():
     with pytest.raises(UserError, match="two frames with an image, found 1"):
         _shuffled(["a", None], 0)
 
 
-def test_a_cut_when_scoring_is_a_cut_when_decoding() -> None:
+def test_a_cut_when_scoring_is_a_cut_when_decoding():
     """What lies below the cut takes no part in NMS and costs no row of those above."""
     rng = np.random.default_rng(0)
-    grid = RadarGrid.reduced(
-        num_doppler=4, num_range=24, num_elevation=4, num_azimuth=16
-    )
+    bins = {"num_range": 24, "num_elevation": 4, "num_azimuth": 16}
+    grid = RadarGrid.reduced(num_doppler=4, **bins)
     params = rng.normal((0, 0, 0, 5, 3, 2, 0, 1), 1, (2, 24, 16, 8))
     maps = DetectionMaps(
         jnp.asarray(rng.normal(-5, 2, (2, 24, 16, 5)), jnp.float32),
         jnp.asarray(params, jnp.float32),
     )
 
-    def columns(score: float) -> dict[str, np.ndarray]:
+    def columns(score):
         options = DecodeOptions(max_detections=30, score_threshold=score)
         decoded = jax.jit(lambda x: decode(x, grid, options))(maps)
         return decoded.to_boxes().columns()
@@ -85,7 +81,7 @@ def test_a_cut_when_scoring_is_a_cut_when_decoding() -> None:
         np.testing.assert_array_equal(low[name][above], column)
 
 
-def test_settings_of_a_run_hold_for_all_protocols_except_all_point() -> None:
+def test_settings_of_a_run_hold_for_all_protocols_except_all_point():
     config = Config().replace(evaluation={"empty_frames": "class"})
     options = report_options(config)
     expected = {"score_threshold": 0.3, "empty_frames": "class"}
@@ -97,7 +93,7 @@ def test_settings_of_a_run_hold_for_all_protocols_except_all_point() -> None:
     assert report_options(config).min_score == 0.0
 
 
-def test_changes_replace_what_the_config_says() -> None:
+def test_changes_replace_what_the_config_says():
     changes = {"protocols": ("auc",), "min_score": 0.2, "roi": None}
     options = report_options(Config(), **changes, classes=("Sedan",))
     assert (options.protocols, options.min_score) == (("auc",), 0.2)
@@ -108,33 +104,31 @@ def test_changes_replace_what_the_config_says() -> None:
 
 
 @pytest.fixture
-def evaluated(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> Callable[..., dict[str, Any]]:
+def evaluated(tmp_path, monkeypatch):
     """Function from options to what is written of a run that is not there."""
 
-    def run(choosing: str, **options: Any) -> dict[str, Any]:
-        written: dict[str, Any] = {}
+    def run(choosing, **options):
+        written = {}
         data = SimpleNamespace(**DATA | {"choosing_split": choosing})
         saved = {"run": "run", "variables": None, "step": 3}
         saved["check_input"] = lambda *found: written.update(compared=found)
         loaded = SimpleNamespace(config=Config(), **saved)
-        evaluation = SimpleNamespace(report=lambda *_, **named: written.update(named))
+        make_evaluation = mock.Mock()
         monkeypatch.setattr(evaluate, "load_model", lambda *_, **__: loaded)
 
-        def data_of_run(saved: Any, other: dict[str, Any] | None) -> Any:
+        def data_of_run(saved, other):
             return saved.config.replace(data=other or {}), data
-
-        def make_evaluation(*_: Any, **named: Any) -> Any:
-            written.update(named)
-            return evaluation
 
         monkeypatch.setattr(evaluate, "data_of_run", data_of_run)
         monkeypatch.setattr(evaluate, "Evaluation", make_evaluation)
         evaluate.evaluate_run(tmp_path, **options)
-        return written
+        report = make_evaluation.return_value.report.call_args
+        return written | make_evaluation.call_args.kwargs | report.kwargs
 
     return run
+
+
+ALL = {"split": "all", "step": "best"}
 
 
 @pytest.mark.parametrize(
@@ -142,23 +136,14 @@ def evaluated(
     [
         ("test", {"step": "best"}, "_checkpoint_best", "chosen on the test split"),
         ("test", {}, "", ""),
-        (
-            *("validation", {"split": "all", "step": "best"}, "_all_checkpoint_best"),
-            "chosen on the validation split",
-        ),
+        ("validation", ALL, "_all_checkpoint_best", "chosen on the validation split"),
         ("test", {"roi": "wide", "step": 70}, "_checkpoint_70_roi_wide", ""),
         ("test", {"out": "elsewhere", "roi": "wide"}, None, ""),
     ],
 )
 def test_folder_and_remark_follow_the_options(
-    choosing: str,
-    options: dict[str, Any],
-    folder: str | None,
-    remark: str,
-    evaluated: Callable[..., dict[str, Any]],
-    tmp_path: pathlib.Path,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+    choosing, options, folder, remark, evaluated, tmp_path, caplog
+):
     """Numbers on the frames that chose the checkpoint are marked."""
     written = evaluated(choosing, **options)
     expected = options["out"] if folder is None else tmp_path / f"evaluation{folder}"
@@ -170,26 +155,22 @@ def test_folder_and_remark_follow_the_options(
 
 
 def test_the_report_names_the_label_version_that_was_read(
-    evaluated: Callable[..., dict[str, Any]],
-    tmp_path: pathlib.Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    evaluated, tmp_path, monkeypatch
+):
     assert evaluated("test")["options"].label_version == "v2.1"
-    data: Any = {"images": lambda _: None, "split": lambda _: []}
+    data = {"images": lambda _: None, "split": lambda _: []}
     monkeypatch.setitem(DATA, "images", data["images"])
     monkeypatch.setitem(DATA, "split", data["split"])
     written = evaluated("test", other={"label_version": "v1.0"}, out=tmp_path)
     assert written["options"].label_version == "v1.0"
 
 
-def test_calibration_of_a_run_is_stored_with_it(
-    tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_calibration_of_a_run_is_stored_with_it(tmp_path, monkeypatch):
     box = np.tile([20.0, 0, 0, 4, 2, 1.5, 0], (2, 1))
     truth = {"frame": np.arange(2), "box": box, "cls": np.array(["Sedan", "Bicycle"])}
-    given: dict[str, Any] = {}
+    given = {}
 
-    def evaluate_run(workdir: pathlib.Path, **options: Any) -> Any:
+    def evaluate_run(workdir, **options):
         given.update(options)
         found = {**truth, "score": np.array([0.9, 0.4])}
         data = EvaluationSet(truth, found, classes=given["classes"])
@@ -204,8 +185,6 @@ def test_calibration_of_a_run_is_stored_with_it(
     assert (stored["step"], stored["evaluation"], stored["iou"]) == (7, "report", 0.3)
     assert (stored["data"], stored["split"]) == ("drives", "validation")
     assert {n: tuple(x) for n, x in stored["classes"].items()} == found["classes"]
-    with pytest.raises(
-        UserError, match=r"report: predictions to fit is .*rian': 0}, exp"
-    ):
+    with pytest.raises(UserError, match=r"report: predictions to fit is .*rian': 0},"):
         evaluate.calibrate_run(tmp_path, classes=("Sedan", "Pedestrian"), split="all")
     assert given["split"] == "all"

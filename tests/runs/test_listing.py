@@ -1,15 +1,13 @@
 """The table of runs: what differs, APs and minutes."""
 
 import json
-import pathlib
 
-from click.testing import CliRunner
-
-from radejax.cli.evaluate import runs
 from radejax.config import Config
 
+from ..commands import run
 
-def _write(folder: pathlib.Path, config: Config, minutes: list[float]) -> pathlib.Path:
+
+def _write(folder, config, minutes):
     folder.mkdir(parents=True)
     (folder / "config.json").write_text(json.dumps(config.without_data_paths()))
     start = {"init_from": None, "init_partial": f"/runs/{folder.name}"}
@@ -19,7 +17,7 @@ def _write(folder: pathlib.Path, config: Config, minutes: list[float]) -> pathli
     return folder
 
 
-def _report(folder: pathlib.Path, ap: float) -> None:
+def _report(folder, ap):
     names = [f"mean/all/ap_{space}_iou30/p/roi=narrow" for space in ("bev", "3d")]
     rows = [{"name": name, "ap": x} for name, x in zip(names, (99.0, ap), strict=True)]
     content = {"ap": rows, "options": {"protocols": ["p"]}, "split": "test"}
@@ -27,14 +25,13 @@ def _report(folder: pathlib.Path, ap: float) -> None:
     (folder / "evaluation" / "metrics.json").write_text(json.dumps(content))
 
 
-def test_runs_are_listed_with_what_differs(tmp_path: pathlib.Path) -> None:
+def test_runs_are_listed_with_what_differs(tmp_path):
     config = Config()
     _report(_write(tmp_path / "a", config, [0.5, 1.0]), 41.5)
     changed = config.replace(seed=1, loss={"weights": {"focal": 4.0, "gwd": 1.0}})
     # It was continued: the second start took 2 minutes.
     _write(tmp_path / "seeds" / "b", changed, [0.5, 1.5, 0.5, 2.0])
-    done = CliRunner().invoke(runs, [str(tmp_path), "--json"])
-    first, second = json.loads(done.output)
+    first, second = json.loads(run("runs", tmp_path, "--json").output)
     names = {"seed", "loss.weights.focal", "init_partial"}
     assert first == {
         "run": "a",
@@ -48,12 +45,10 @@ def test_runs_are_listed_with_what_differs(tmp_path: pathlib.Path) -> None:
     assert (second["run"], second["minutes"], second["ap"]) == ("seeds/b", 3.5, None)
     assert second["fields"].items() >= {"seed": 1, "loss.weights.focal": 4.0}.items()
     assert set(second["fields"]) == names
-    table = CliRunner().invoke(runs, [str(tmp_path)]).output
+    table = run("runs", tmp_path).output
     assert "AP: map_3d_iou30/p/roi=narrow, test split" in table
     assert "seed=1, loss.weights.focal=4.0" in table
 
 
-def test_a_folder_without_runs_is_wrong_use(tmp_path: pathlib.Path) -> None:
-    done = CliRunner().invoke(runs, [str(tmp_path)])
-    assert done.exit_code == 2
-    assert "no run in" in done.stderr
+def test_a_folder_without_runs_is_wrong_use(tmp_path):
+    assert "no run in" in run("runs", tmp_path, code=2).stderr

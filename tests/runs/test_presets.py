@@ -10,7 +10,7 @@ from radejax.config import load_config
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 
 
-def _tables() -> dict[str, dict[str, tuple[str, str, str]]]:
+def _tables():
     """Values in `paper` and `official` and the source, by field, of both tables."""
     text = (ROOT / "docs" / "reports" / "preset_sources.md").read_text(encoding="utf-8")
     part = text.partition("## Every field of both presets\n")[2].partition("\n## ")[0]
@@ -37,9 +37,7 @@ TABLES = _tables()
         ("dinorade", TABLES["RADE-Net"] | TABLES["DinoRADE"]),
     ],
 )
-def test_the_page_has_every_field_of_both_presets(
-    config: str, rows: dict[str, tuple[str, str, str]]
-) -> None:
+def test_the_page_has_every_field_of_both_presets(config, rows):
     for i, preset in enumerate(("paper", "official")):
         values = load_config(f"{config}:{preset}")
         fields = {re.sub(r"weights\..*", "weights", n): x for n, x in values.fields()}

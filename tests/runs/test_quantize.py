@@ -1,8 +1,6 @@
 """An export in int8 of a small model on simulated data."""
 
 import json
-import pathlib
-from typing import Any
 
 import jax
 import numpy as np
@@ -16,23 +14,16 @@ from radejax.runs.data import located, simulate_missing
 
 from .. import small_models as small
 
-SETTINGS: dict[str, Any] = {
-    "kind": "onnx",
-    "radar_input": "projection",
-    "batch_size": None,
-}
+SETTINGS = {"kind": "onnx", "radar_input": "projection", "batch_size": None}
 
 
 @pytest.fixture(scope="module")
-def detector(tmp_path_factory: pytest.TempPathFactory) -> Detector:
+def detector(tmp_path_factory):
     """Detector with random weights on a dataset of four frames to train on and three others."""
     config = small.shrink_run(load_config("quickstart:short"))
     sizes = {"train_sequences": 2, "test_sequences": 3, "frames_per_sequence": 1}
-    config = config.replace(
-        simulation=sizes,
-        data={"roots": (str(tmp_path_factory.mktemp("data") / "simulated"),)},
-    )
-    config = located(config)
+    root = tmp_path_factory.mktemp("data") / "simulated"
+    config = located(config.replace(simulation=sizes, data={"roots": (str(root),)}))
     simulate_missing(config)
     grid = config.simulation.make_grid()
     inputs = np.zeros((1, *grid.projection_shape), np.float32)
@@ -40,9 +31,7 @@ def detector(tmp_path_factory: pytest.TempPathFactory) -> Detector:
     return Detector(SavedModel(config, grid, variables))
 
 
-def test_other_programs_are_rejected_before_data_are_read(
-    tmp_path: pathlib.Path,
-) -> None:
+def test_other_programs_are_rejected_before_data_are_read(tmp_path):
     radar, two = small.detector(), small.detector(num_frames=2)
     text = "needs --format onnx, --input projection, batch size 1"
     for given, settings, message in (
@@ -58,9 +47,7 @@ def test_other_programs_are_rejected_before_data_are_read(
 
 
 @pytest.mark.slow
-def test_convolutions_are_int8_and_the_readme_has_both_aps(
-    detector: Detector, tmp_path: pathlib.Path
-) -> None:
+def test_convolutions_are_int8_and_the_readme_has_both_aps(detector, tmp_path):
     onnx = pytest.importorskip("onnx")
     onnxruntime = pytest.importorskip("onnxruntime")
     pytest.importorskip("jax2onnx")

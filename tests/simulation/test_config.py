@@ -6,12 +6,8 @@ import pytest
 
 from radejax.core.errors import UserError
 from radejax.data.kradar.conditions import WEATHERS as KRADAR_WEATHERS
-from radejax.simulation.config import (
-    CONDITIONS,
-    FULL_SIZE,
-    RadarOptions,
-    SimulationOptions,
-)
+from radejax.simulation import config as simulation
+from radejax.simulation.config import FULL_SIZE, SimulationOptions
 from radejax.simulation.radar.propagation import WEATHERS
 from radejax.simulation.radar.tensor import RadarParameters
 from radejax.simulation.world.environments import ENVIRONMENTS
@@ -26,11 +22,12 @@ def test_default_has_every_weather_in_training_and_several_held_out():
     config = SimulationOptions()
     train = [config.conditions(n)[2] for n in range(1, config.train_sequences + 1)]
     assert set(train) == set(WEATHERS) == set(KRADAR_WEATHERS)
-    assert {environment for environment, *_ in CONDITIONS} == set(ENVIRONMENTS)
+    assert {environment for environment, *_ in simulation.CONDITIONS} == set(
+        ENVIRONMENTS
+    )
     last = config.train_sequences + config.test_sequences
-    held_out = [
-        config.conditions(n)[2] for n in range(config.train_sequences + 1, last + 1)
-    ]
+    test = range(config.train_sequences + 1, last + 1)
+    held_out = [config.conditions(n)[2] for n in test]
     assert len(set(held_out)) >= 4
 
 
@@ -93,8 +90,6 @@ def test_a_sensor_is_changed_or_replaced():
     changed = options.replace(radar={"preset": "ideal"})
     assert changed.radar.make_parameters().azimuth_elements == 40.0
     full = changed.replace(**FULL_SIZE)
-    assert full.radar == RadarOptions() != options.radar
-    assert (
-        full.radar.make_parameters().azimuth_elements
-        == RadarParameters().azimuth_elements
-    )
+    assert full.radar == simulation.RadarOptions() != options.radar
+    elements = full.radar.make_parameters().azimuth_elements
+    assert elements == RadarParameters().azimuth_elements

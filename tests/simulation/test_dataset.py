@@ -1,6 +1,5 @@
 """The written tree: readable as K-Radar's, the same bytes, resumable, guarded."""
 
-import hashlib
 import json
 import os
 import shutil
@@ -14,6 +13,7 @@ from PIL import Image
 
 from radejax.core import files
 from radejax.core.errors import DataError, UserError
+from radejax.core.manifest import checksums
 from radejax.data.cameras import CameraOptions, camera_inputs
 from radejax.data.kradar import KRadar, read_labels
 from radejax.data.kradar.check import check_dataset
@@ -29,29 +29,21 @@ from .. import small_models as small
 
 
 def small_config(**changes):
+    grid = {"num_doppler": 8, "num_range": 32, "num_elevation": 5, "num_azimuth": 24}
     fields = {
         "train_sequences": 2,
         "test_sequences": 1,
         "frames_per_sequence": 3,
         "image_width": 64,
         "image_height": 36,
-        "grid": {
-            "num_doppler": 8,
-            "num_range": 32,
-            "num_elevation": 5,
-            "num_azimuth": 24,
-            "max_range_m": 62.0,
-        },
+        "grid": grid | {"max_range_m": 62.0},
     }
     return SimulationOptions(**fields | changes)
 
 
 def digests(root):
-    files = sorted(p for p in root.rglob("*") if p.is_file())
-    return {
-        str(p.relative_to(root)): hashlib.sha256(p.read_bytes()).hexdigest()
-        for p in files
-    }
+    files = sorted(path for path in root.rglob("*") if path.is_file())
+    return checksums(root, *(str(path.relative_to(root)) for path in files))
 
 
 @pytest.fixture(scope="module")
@@ -80,9 +72,8 @@ class TestTree:
     def test_a_model_sees_through_the_cameras_that_drew_the_images(self, tree):
         cameras = camera_inputs(KRadar(tree)[:1], (36, 64), CameraOptions()).cameras
         drawn = stereo_calibration(small_config())[0].camera()
-        np.testing.assert_allclose(
-            cameras[0].cam_from_ego, drawn.cam_from_ego, atol=1e-12
-        )
+        found, expected = cameras[0].cam_from_ego, drawn.cam_from_ego
+        np.testing.assert_allclose(found, expected, atol=1e-12)
 
     def test_file_numbers_agree_with_the_header(self, tree):
         for frame in KRadar(tree):
@@ -110,14 +101,10 @@ class TestTree:
         read = {f.key: f for f in KRadar(tree, visibility=None)}
         for number in (1, 2, 3):
             first, second, third = (f for f in read.values() if f.sequence == number)
-            known = [
-                dict(zip(f.columns["track_id"].tolist(), values, strict=True))
-                for f, values in (
-                    (first, first.boxes),
-                    (second, second.columns["velocity_mps"]),
-                    (third, third.boxes),
-                )
-            ]
+            velocities = second.columns["velocity_mps"]
+            ids = [f.columns["track_id"].tolist() for f in (first, second, third)]
+            values = [first.boxes, velocities, third.boxes]
+            known = [dict(zip(*x, strict=True)) for x in zip(ids, values, strict=True)]
             tracks = set.intersection(*map(set, known))
             assert len(tracks) >= 3
             for track in tracks:
@@ -144,19 +131,16 @@ class TestTree:
             velocity = frame.columns["velocity_mps"] + turning
             velocity[:, 0] += ego["speed_mps"][index]
             tracks = frame.columns["track_id"] - 1  # of procedural sequences
-            expected = scene.tracks.velocity_mps[index, tracks]
+            expected = np.linalg.norm(scene.tracks.velocity_mps[index, tracks], axis=1)
             speed = np.linalg.norm(velocity, axis=1)
             np.testing.assert_allclose(frame.columns["speed_mps"], speed, atol=1e-4)
-            np.testing.assert_allclose(
-                speed, np.linalg.norm(expected, axis=1), atol=0.1
-            )
+            np.testing.assert_allclose(speed, expected, atol=0.1)
 
 
 class TestRepeating:
     def test_same_seed_same_bytes_by_worker_processes(self, tree, tmp_path):
-        again = simulate_dataset(
-            small_config(), tmp_path / "again", num_workers=2, progress=False
-        )
+        out, options = tmp_path / "again", {"num_workers": 2, "progress": False}
+        again = simulate_dataset(small_config(), out, **options)
         assert digests(again) == digests(tree)
 
     def test_resumes_after_an_interruption_with_the_same_bytes(
@@ -190,9 +174,7 @@ class TestRepeating:
         assert digests(root) == digests(tree)
 
     def test_finished_dataset_is_reused_unchanged(self, tree, monkeypatch):
-        monkeypatch.setattr(
-            dataset.Writer, "write_frames", lambda *a: pytest.fail("simulated again")
-        )
+        monkeypatch.setattr(dataset.Writer, "write_frames", None)
         assert simulate_dataset(small_config(), tree, progress=False) == tree
 
     @pytest.mark.parametrize(
@@ -214,19 +196,16 @@ class TestRepeating:
         assert simulate_dataset(small_config(), copy, progress=False) == copy
 
 
-class TestWrongUse:
-    def test_folders_with_something_else_are_left_alone(self, tree, tmp_path):
-        file, other = tmp_path / "file", tmp_path / "other"
-        file.write_text("mine")
-        other.mkdir()
-        (other / "holiday.txt").write_text("mine")
-        for root, message in (
-            (file, "is a file"),
-            (other, "not empty"),
-            (tree, "another simulation config.*seed"),
-        ):
-            with pytest.raises(UserError, match=message):
-                simulate_dataset(small_config(seed=5), root, progress=False)
+def test_folders_with_something_else_are_left_alone(tree, tmp_path):
+    file = tmp_path / "holiday.txt"
+    file.write_text("mine")
+    for root, message in (
+        (file, "is a file"),
+        (tmp_path, "not empty"),
+        (tree, "another simulation config.*seed"),
+    ):
+        with pytest.raises(UserError, match=message):
+            simulate_dataset(small_config(seed=5), root, progress=False)
 
 
 def test_expected_size_is_that_of_the_files(tree, tmp_path):
@@ -242,9 +221,8 @@ def test_expected_size_is_that_of_the_files(tree, tmp_path):
 
 def test_a_sensor_without_elevation_is_a_kradar_tree_without_its_channels(tmp_path):
     grid = small.uneven_grid(fov_range_m=60.0, range_m=np.geomspace(2.0, 60.0, 32))
-    config = small_config(
-        grid=grid.to_dict(), frames_per_sequence=1, image_width=0, train_sequences=1
-    )
+    sizes = {"frames_per_sequence": 1, "image_width": 0, "train_sequences": 1}
+    config = small_config(grid=grid.to_dict(), **sizes)
     root = simulate_dataset(config, tmp_path / "data", progress=False)
     assert check_dataset(root).num_problems == 0
     frames = KRadar(root)

@@ -84,9 +84,8 @@ def test_labels_are_in_the_lidar_frame(urban):
     assert len(labels) == (distance < 60.0).sum()
     for n in np.flatnonzero(distance < 60.0):
         box = by_id[urban.sequence.tracks.track_id[frame.track[n]]].box
-        np.testing.assert_allclose(
-            np.add(box[:3], (-2.54, 0.3, 0.7)), frame.boxes[n, :3]
-        )
+        position = np.add(box[:3], (-2.54, 0.3, 0.7))
+        np.testing.assert_allclose(position, frame.boxes[n, :3])
 
 
 def test_training_sequences_come_first_and_sensors_count_their_own_frames():
@@ -104,9 +103,8 @@ def test_training_sequences_come_first_and_sensors_count_their_own_frames():
 
 def test_vru_density_scale_changes_training_scenes_only():
     options = SimulationOptions(train_sequences=6, test_sequences=6)
-    natural, added = (
-        make_source(options.replace(vru_density_scale=n)) for n in (1.0, 4.0)
-    )
+    natural = make_source(options)
+    added = make_source(options.replace(vru_density_scale=4.0))
 
     def classes(source, numbers):
         return np.concatenate([source.make(n).tracks.cls for n in numbers])

@@ -57,13 +57,9 @@ class Tiny:
             info=info or {},
             keys=[f"1/{i:05d}" for i in range(NUM_FRAMES)],
         )
-        arguments = {
-            "config": self.config,
-            "model": self.model,
-            "weights": self.variables,
-        }
-        mesh = devices.make_mesh(num_devices)
-        return fit(data=data, workdir=workdir, mesh=mesh, **(arguments | changes))
+        given = {"config": self.config, "model": self.model, "workdir": workdir}
+        given |= {"weights": self.variables, **changes}
+        return fit(data=data, mesh=devices.make_mesh(num_devices), **given)
 
 
 @pytest.fixture(scope="session")
@@ -108,9 +104,8 @@ def make_frames(grid: RadarGrid, seed: int) -> Batch:
     rng = np.random.default_rng(seed)
     n = NUM_FRAMES
     cells = np.stack([rng.integers(4, 14, (n, 2)), rng.integers(2, 12, (n, 2))], -1)
-    xy = grid.bin_to_ego(
-        *np.moveaxis(cells + rng.uniform(-0.3, 0.3, cells.shape), -1, 0)
-    )
+    places = cells + rng.uniform(-0.3, 0.3, cells.shape)
+    xy = grid.bin_to_ego(*np.moveaxis(places, -1, 0))
     projection = 0.05 * rng.random((n, *grid.projection_shape))
     for frame in range(n):
         projection[frame, cells[frame, :, 0], cells[frame, :, 1]] += 0.6

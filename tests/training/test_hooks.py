@@ -2,9 +2,8 @@
 
 import itertools
 import json
-from collections.abc import Callable
 from types import SimpleNamespace
-from typing import Any
+from unittest import mock
 
 import jax.numpy as jnp
 import pytest
@@ -15,19 +14,19 @@ from radejax.training import hooks, loop
 from radejax.training.metric_writer import MetricWriter
 
 
-def _step(state: Any, batch: int) -> tuple[Any, Any]:
+def _step(state, batch):
     after = SimpleNamespace(step=state.step + 1, seen=[*state.seen, batch])
     return after, {"loss": jnp.float32(batch)}
 
 
 def test_hooks_are_called_in_order_after_each_step():
-    calls: list[Any] = []
+    calls = []
 
-    def named(name: str) -> hooks.Hook:
+    def named(name):
         return lambda step, state, metrics: calls.append((name, step, state.seen[-1]))
 
     called = [named("a"), hooks.every(5, 2, named("b")), hooks.every(5, 0, named("c"))]
-    state: Any = SimpleNamespace(step=1, seen=[])
+    state = SimpleNamespace(step=1, seen=[])
     state = loop.train(state, _step, itertools.count(7), called, num_steps=5)
     assert (state.step, state.seen) == (5, [7, 8, 9, 10])
     a, b = ([c[1:] for c in calls if c[0] == name] for name in "ab")
@@ -37,28 +36,19 @@ def test_hooks_are_called_in_order_after_each_step():
 
 
 def test_the_loop_stops_between_steps_of_which_two_are_under_way(monkeypatch):
-    waited_for: list[float] = []
-    monkeypatch.setattr(
-        loop.jax,
-        "block_until_ready",
-        lambda metrics: waited_for.append(float(metrics["loss"])),
-    )
-    answers = iter([False] * 5 + [True])
-    state: Any = SimpleNamespace(step=0, seen=[])
-    state = loop.train(
-        state,
-        _step,
-        itertools.count(),
-        [],
-        num_steps=9,
-        should_stop=lambda: next(answers),
-    )
+    wait = mock.Mock()
+    monkeypatch.setattr(loop.jax, "block_until_ready", wait)
+    should_stop = mock.Mock(side_effect=[False] * 5 + [True])
+    state, batches = SimpleNamespace(step=0, seen=[]), itertools.count()
+    options = {"num_steps": 9, "should_stop": should_stop}
+    state = loop.train(state, _step, batches, [], **options)
     assert state.seen == [0, 1, 2, 3, 4]
-    assert waited_for == [0, 1, 2]  # from the third step on, for that two steps before
+    # From the third step on, for that two steps before.
+    assert [call.args[0]["loss"] for call in wait.call_args_list] == [0, 1, 2]
 
 
 def test_values_that_an_own_hook_returns_are_logged(tmp_path):
-    def own(step: int, *_: Any) -> Any:
+    def own(step, *_):
         return {3: {"norm": 2.5}, 4: "text"}.get(step)
 
     with MetricWriter(tmp_path, Config(), 0) as writer:
@@ -77,7 +67,7 @@ def wait(monkeypatch):
     """Function that sets the hooks' clock forward, which moves by 1 ns per look at it."""
     now = 0.0
 
-    def go_on(seconds: float = 1e-9) -> float:
+    def go_on(seconds=1e-9):
         nonlocal now
         now += seconds
         return now
@@ -86,7 +76,7 @@ def wait(monkeypatch):
     return go_on
 
 
-def _batches(wait: Callable[[float], float], *seconds: float) -> Any:
+def _batches(wait, *seconds):
     """Batches that take some seconds to read."""
     return (SimpleNamespace(frame=wait(x)) for x in seconds)
 
@@ -97,7 +87,7 @@ def test_waiting_for_data_is_warned_of_once(wait, tmp_path, monkeypatch, caplog)
     throughput = hooks.Throughput(_batches(wait, 0.0, 0.2, 0.2), 0)
     bar = hooks.ProgressBar(0, 10)
     with MetricWriter(tmp_path, config, 0) as writer:
-        log: Any = hooks.Log(config, 10, throughput, writer, bar)
+        log = hooks.Log(config, 10, throughput, writer, bar)
         for step in (1, 2, 3):
             next(throughput)
             wait(0.1)  # training
@@ -105,9 +95,8 @@ def test_waiting_for_data_is_warned_of_once(wait, tmp_path, monkeypatch, caplog)
             for hook in (throughput, bar, log):
                 hook(step, None, metrics)
             assert len(caplog.records) == min(step - 1, 1)
-    first, row, _ = map(
-        json.loads, (tmp_path / "metrics.jsonl").read_text().splitlines()
-    )
+    lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
+    first, row, _ = map(json.loads, lines)
     assert list(first) == ["step", "minutes", "focal", "learning_rate", "epoch"]
     assert (row["step"], row["focal"], row["epoch"], bar.n) == (2, 1.0, 0.2, 3)
     assert row["frames_per_s"] == pytest.approx(10 / 0.3)

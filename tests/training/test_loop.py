@@ -3,11 +3,9 @@
 import functools
 import json
 import os
-import pathlib
 import re
 import shutil
 import signal
-from typing import Any
 
 import chex
 import grain
@@ -21,12 +19,11 @@ from matplotlib.figure import Figure
 
 from radejax.core import devices
 from radejax.core.errors import DataError, UserError
-from radejax.core.structures import Batch
 from radejax.runs import experiment
 from radejax.training import loop
 from radejax.training.checkpoints import Checkpoints
 from radejax.training.metric_writer import Scores
-from radejax.training.step import TrainState, count_steps, create_state, make_schedule
+from radejax.training.step import count_steps, create_state, make_schedule
 
 STEPS_PER_EPOCH = 4
 
@@ -35,10 +32,10 @@ STEPS_PER_EPOCH = 4
 def compiled_once():
     """Steps of equal options are the same function, which JAX traces once."""
 
-    found: dict[Any, Any] = {}
+    found = {}
 
-    def once(make: Any, key: Any) -> Any:
-        def call(*parts: Any, **options: Any) -> Any:
+    def once(make, key):
+        def call(*parts, **options):
             name = make, key(*parts)
             return found.setdefault(name, (make(*parts, **options), parts))[0]
 
@@ -81,30 +78,30 @@ def finished(undisturbed, workdir):
 class Stopping(grain.DatasetIterator):
     """A loader that has something happen at its n-th batch from the start."""
 
-    def __init__(self, loader: Any, at: int, what: Any) -> None:
+    def __init__(self, loader, at, what):
         super().__init__()
         self._loader, self._at, self._what = loader, at, what
         self._count = 0
 
-    def __next__(self) -> Any:
+    def __next__(self):
         self._count += 1
         if self._count == self._at:
             self._what()
         return next(self._loader)
 
-    def get_state(self) -> Any:
+    def get_state(self):
         return self._loader.get_state()
 
-    def set_state(self, state: Any) -> None:
+    def set_state(self, state):
         self._loader.set_state(state)
 
 
-def _losses(folder: pathlib.Path) -> list[tuple[int, float]]:
+def _losses(folder):
     lines = (folder / "metrics.jsonl").read_text().splitlines()
     return [(r["step"], r["focal"]) for r in map(json.loads, lines)]
 
 
-def check_equal(result: Any, undisturbed: Any) -> None:
+def check_equal(result, undisturbed):
     """A run that is finished has the state of the undisturbed one, bit for bit."""
     state, is_finished = result
     assert is_finished
@@ -122,7 +119,7 @@ def test_a_run_ends_after_its_epochs_and_learns(undisturbed):
 
 @pytest.mark.slow
 def test_a_seed_initializes_the_variables(run, tiny, tmp_path):
-    def initial(name: str, seed: int) -> Any:
+    def initial(name, seed):
         rates = {"learning_rate": 1e-30, "final_learning_rate": 0.0}
         config = tiny.config.replace(seed=seed, train={"num_epochs": 1} | rates)
         options = {"steps_per_epoch": 1, "weights": None, "config": config}
@@ -138,7 +135,7 @@ def test_a_seed_initializes_the_variables(run, tiny, tmp_path):
 def test_a_crash_costs_the_steps_since_the_checkpoint_and_no_digit(
     batch, run, tiny, undisturbed, workdir
 ):
-    def crash() -> None:
+    def crash():
         raise RuntimeError("power cut")
 
     # One batch is looked at for its shapes before the first step. A crash before the first
@@ -152,14 +149,14 @@ def test_a_crash_costs_the_steps_since_the_checkpoint_and_no_digit(
 def test_sigterm_saves_and_stops(run, tiny, undisturbed, workdir):
     config = tiny.config.replace(train={"evaluate_every_epochs": 1})
 
-    def evaluate(_: Any, should_stop: Any) -> Scores:
+    def evaluate(_, should_stop):
         assert not should_stop()
         os.kill(os.getpid(), signal.SIGTERM)
         if should_stop():
             raise devices.Stopped
         raise AssertionError("the signal was not seen")
 
-    def start(*batches: Any) -> Any:
+    def start(*batches):
         return run(workdir, *batches, config=config, validate=evaluate)
 
     terminate = functools.partial(os.kill, os.getpid(), signal.SIGTERM)
@@ -185,9 +182,9 @@ def test_a_run_continues_with_the_same_data_and_frozen_weights_only(
 
 @pytest.mark.slow
 def test_frozen_parameters_are_saved_and_stay_as_they_were(run, tiny, workdir):
-    def train(steps: int) -> TrainState:
+    def train(steps):
         changes = {"freeze": ("backbone/encoder_*",), "max_steps": steps}
-        state: TrainState = run(workdir, config=tiny.config.replace(train=changes))[0]
+        state = run(workdir, config=tiny.config.replace(train=changes))[0]
         return state
 
     train(3)
@@ -219,13 +216,12 @@ def test_a_state_comes_back_bit_for_bit_on_another_number_of_devices(
 ):
     state = undisturbed[0][0]
 
-    def placed(count: int) -> Any:
+    def placed(count):
         return devices.state_sharding(state, devices.make_mesh(count), "fsdp", 64)
 
     saved = jax.device_put(state, placed(first))
-    assert first == 1 or any(
-        not x.is_fully_replicated for x in jax.tree.leaves(saved.params)
-    )
+    is_whole = [x.is_fully_replicated for x in jax.tree.leaves(saved.params)]
+    assert first == 1 or not all(is_whole)
     with Checkpoints(tmp_path) as checkpoints:
         checkpoints.save(8, saved, tiny.loader(), info={})
         checkpoints.wait()
@@ -242,7 +238,7 @@ def test_steps_without_finite_loss_are_named_and_end_the_run(
     run, tiny, workdir, caplog
 ):
     class Poisoned(Stopping):
-        def __next__(self) -> Any:
+        def __next__(self):
             batch = super().__next__()
             if self._count > self._at:
                 return batch
@@ -269,13 +265,12 @@ def test_steps_without_finite_loss_are_named_and_end_the_run(
 
 def test_evaluation_on_the_way_is_logged_and_the_best_kept(run, tiny, workdir):
     """A run of a given number of steps, which is not a multiple of those of an epoch."""
-    config = tiny.config.replace(
-        train={"evaluate_every_epochs": 1, "max_steps": 8, "checkpoints_to_keep": 1}
-    )
+    fields = {"evaluate_every_epochs": 1, "max_steps": 8, "checkpoints_to_keep": 1}
+    config = tiny.config.replace(train=fields)
     values = iter((1.5, 3.5, 2.5))
     name = "validation/ap_bev_iou30/exact"
 
-    def evaluate(_: Any, should_stop: Any) -> Scores:
+    def evaluate(_, should_stop):
         best = next(values)
         return Scores({name: best}, best, {"a": Figure()})
 
@@ -312,7 +307,7 @@ def test_debugging_works(tiny, tmp_path, one_device, setting):
     `logsumexp` in the first one.
     """
 
-    def step(state: TrainState, batch: Batch, _: jax.Array) -> Any:
+    def step(state, batch, _):
         mean = batch.projection.mean(dtype=jnp.float32)
         loss = jnp.log(mean) + jax.nn.logsumexp(state.params["w"])
         return state.replace(step=state.step + 1), {"loss": loss}

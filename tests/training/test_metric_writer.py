@@ -15,12 +15,12 @@ from radejax.core.errors import DiskFullError, UserError
 from radejax.training.metric_writer import MetricWriter
 
 
-def _steps(folder: pathlib.Path) -> list[int]:
+def _steps(folder):
     lines = (folder / "metrics.jsonl").read_text().splitlines()
     return [json.loads(line)["step"] for line in lines]
 
 
-def _writer(folder: pathlib.Path, start: int, **logging: object) -> MetricWriter:
+def _writer(folder, start, **logging):
     return MetricWriter(folder, Config().replace(logging=logging), start)
 
 

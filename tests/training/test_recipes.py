@@ -1,14 +1,12 @@
 """The configs of both papers: what they say, and two steps of each at tiny size."""
 
-from typing import Any
-
 import chex
 import jax
 import numpy as np
 import pytest
 
 from radejax import models
-from radejax.config import Config, load_config
+from radejax.config import load_config
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.models.options import DinoRadeOptions
 from radejax.training.step import (
@@ -41,9 +39,7 @@ ALL = [
         ("dinorade", "official", 6, 11, 1e-5, 5, "v2.1"),
     ],
 )
-def test_trainings_are_those_of_the_papers(
-    name, words, batch, epochs, floor, classes, labels
-):
+def test_trainings_of_the_papers(name, words, batch, epochs, floor, classes, labels):
     config = load_config(f"{name}:{words}")
     train = config.train
     assert (train.batch_size, train.num_epochs) == (batch, epochs)
@@ -57,11 +53,9 @@ def test_trainings_are_those_of_the_papers(
     is_cyclic = "official" in words
     period = 2 * (steps // epochs) if is_cyclic else 2 * steps
     phase = np.cos(2 * np.pi * np.arange(steps + 1) / period)
-    np.testing.assert_allclose(
-        jax.jit(schedule)(np.arange(steps + 1)),
-        floor + (1e-3 - floor) * (1 + phase) / 2,
-        rtol=1e-4,
-    )
+    rates = jax.jit(schedule)(np.arange(steps + 1))
+    expected = floor + (1e-3 - floor) * (1 + phase) / 2
+    np.testing.assert_allclose(rates, expected, rtol=1e-4)
 
 
 RELEASE = {"model.input_center", "model.input_scale", "data.release"}
@@ -89,11 +83,11 @@ def test_a_word_changes_only_its_fields(preset, word, changed):
         assert (after["model.input_scale"], after["data.release"]) == (25.0, word)
 
 
-def _shrink(config: Config) -> Config:
+def _shrink(config):
     """The same choices on a sensor of 8 x 8 bins."""
     model = config.model
     is_wide = model.decoder_width > model.widths[0] and model.heads != "default"
-    changes: dict[str, Any] = {
+    changes = {
         "doppler_bins": 5,
         "elevation_bins": 4,
         "widths": (8, 8),
@@ -125,9 +119,8 @@ def _shrink(config: Config) -> Config:
 @pytest.mark.parametrize(("name", "words"), ALL)
 def test_two_steps_of_every_config(name, words):
     config = _shrink(load_config(f"{name}:{words}"))
-    grid = RadarGrid.reduced(
-        num_doppler=5, num_range=8, num_elevation=4, num_azimuth=8, max_range_m=30.0
-    )
+    bins = {"num_doppler": 5, "num_range": 8, "num_elevation": 4, "num_azimuth": 8}
+    grid = RadarGrid.reduced(**bins, max_range_m=30.0)
     has_camera = isinstance(config.model, DinoRadeOptions)
     rng = np.random.default_rng(0)
     projection = rng.random((2, *grid.projection_shape)).astype(np.float16)
@@ -135,28 +128,16 @@ def test_two_steps_of_every_config(name, words):
     batch = jax.device_put(labeled_batch(projection, image))
     model = models.build(config.model)
     optimizer = make_optimizer(config.train, lambda _: 1e-3)
-    start = create_state(
-        drawn(model, *batch.model_inputs()),
-        optimizer,
-        use_ema=False,
-        model=model,
-    )
-    step = jax.jit(
-        make_train_step(
-            model,
-            optimizer,
-            models.map_grid(grid, model, config.data.azimuth_mapping),
-            loss=config.loss,
-        )
-    )
+    variables = drawn(model, *batch.model_inputs())
+    start = create_state(variables, optimizer, use_ema=False, model=model)
+    grid = models.map_grid(grid, model, config.data.azimuth_mapping)
+    step = jax.jit(make_train_step(model, optimizer, grid, loss=config.loss))
     state = start
     for _ in range(2):
         state, metrics = step(state, batch, jax.random.key(1))
     assert (int(state.step), int(metrics["skipped"])) == (2, 0)
     chex.assert_tree_all_finite((state.params, metrics))
-    changed = jax.tree.map(
-        lambda a, b: bool((a != b).any()), state.params, start.params
-    )
+    changed = jax.tree.map(lambda a, b: (a != b).any(), state.params, start.params)
     assert np.mean(jax.tree.leaves(changed)) > 0.9
     chex.assert_trees_all_equal(state.frozen, start.frozen)
     assert bool(start.frozen) == (has_camera and config.model.image.freeze)

@@ -1,7 +1,5 @@
 """Schedule and optimizer against numbers worked out by hand and torch's AdamW rule."""
 
-from typing import Any
-
 import chex
 import flax.linen as nn
 import jax
@@ -21,40 +19,31 @@ from radejax.training.step import (
 )
 
 
-def _schedule(steps_per_epoch: int, num_epochs: int = 1, **fields: Any) -> Any:
+def _schedule(steps_per_epoch, num_epochs=1, **fields):
     rates = {"learning_rate": 1e-3, "final_learning_rate": 1e-4, "schedule": "cosine"}
-    train = TrainOptions(
-        **rates | {"warmup_steps": 0, "num_epochs": num_epochs} | fields
-    )
-    return make_schedule(train, steps_per_epoch)
+    rates |= {"warmup_steps": 0, "num_epochs": num_epochs}
+    return make_schedule(TrainOptions(**rates | fields), steps_per_epoch)
 
 
 CYCLIC = {"schedule": "cyclic_cosine", "final_learning_rate": 1e-5}
+_warm_up_of_cycles = _schedule(10, 6, warmup_steps=4, **CYCLIC)
 
 
 @pytest.mark.parametrize(
     ("schedule", "steps", "rates"),
     [
         (_schedule(100), (0, 50, 100, 150), (1e-3, 5.5e-4, 1e-4, 1e-4)),
-        (
-            _schedule(50, 2, warmup_steps=10),
-            (0, 5, 10, 55, 100),
-            (0, 5e-4, 1e-3, 5.5e-4, 1e-4),
-        ),
+        (_schedule(50, 2, warmup_steps=10), (0, 5, 10, 55), (0, 5e-4, 1e-3, 5.5e-4)),
         (_schedule(50, 1, max_steps=100), (0, 50, 100), (1e-3, 5.5e-4, 1e-4)),
         (_schedule(10, 6, max_steps=20, **CYCLIC), (0, 10, 20), (1e-3, 1e-5, 1e-3)),
-        (
-            _schedule(10, 6, warmup_steps=4, **CYCLIC),
-            (0, 2, 4, 14, 24),
-            (0, 5e-4, 1e-3, 1e-5, 1e-3),
-        ),
+        (_warm_up_of_cycles, (0, 2, 4, 14, 24), (0, 5e-4, 1e-3, 1e-5, 1e-3)),
     ],
 )
 def test_rates_by_step(schedule, steps, rates):
     np.testing.assert_allclose([float(schedule(x)) for x in steps], rates, rtol=1e-5)
 
 
-def _torch_recursion(peak: float, floor: float, period: int, steps: int) -> np.ndarray:
+def _torch_recursion(peak, floor, period, steps):
     """`CosineAnnealingLR.get_lr` of torch, stepped `steps` times, in float64."""
     rates = [peak]
     for epoch in range(1, steps):
@@ -104,13 +93,12 @@ def test_first_step_is_adamw_with_torch_defaults():
     grads = {"kernel": jnp.array([0.1, 4.0]), "bias": jnp.array([-1.0])}
     updates, _ = optimizer.update(grads, optimizer.init(params), params)
 
-    def expected(p: np.ndarray, g: np.ndarray) -> np.ndarray:
+    def expected(p, g):
         # Bias-corrected moments of one step are g and g^2; decay is on every parameter.
         return -1e-3 * (g / (np.abs(g) + 1e-8) + 0.01 * p)
 
-    chex.assert_trees_all_close(
-        updates, jax.tree.map(expected, params, grads), rtol=1e-5
-    )
+    wanted = jax.tree.map(expected, params, grads)
+    chex.assert_trees_all_close(updates, wanted, rtol=1e-5)
 
 
 class WithFrozenPart(nn.Module):
@@ -144,13 +132,11 @@ def test_frozen_parameters_have_no_optimizer_state_and_no_average():
 
 def test_patterns_are_of_parameters_or_of_whole_parts():
     params = {"backbone": {"encoder_1": 1, "decoder_1": 2}, "image": {"w": 3}}
+    parts = {"backbone": {"encoder_1": 1}, "image": {"w": 3}}
     for patterns, frozen in (
         ((), {}),
         (("backbone",), {"backbone": params["backbone"]}),
-        (
-            ("backbone/enc*", "image/w"),
-            {"backbone": {"encoder_1": 1}, "image": {"w": 3}},
-        ),
+        (("backbone/enc*", "image/w"), parts),
     ):
         parts = split_parameters(params, WithFrozenPart(), patterns)
         assert parts[1] == frozen
@@ -160,7 +146,11 @@ def test_patterns_are_of_parameters_or_of_whole_parts():
 PARAMS = {"backbone": {"w": 1}, "image": {"w": 3}}
 
 
-def _schedule_of(name: str) -> Any:
+def _optimizer_of(name):
+    return make_optimizer(TrainOptions(optimizer=name), lambda _: 1e-3)
+
+
+def _schedule_of(name):
     return make_schedule(TrainOptions(num_epochs=1, schedule=name), 5)
 
 
@@ -168,20 +158,11 @@ def _schedule_of(name: str) -> Any:
 @pytest.mark.parametrize(
     ("call", "message"),
     [
+        (lambda: _optimizer_of("lion"), "is 'lion', expected adamw or module:function"),
+        (lambda: _schedule_of("linear"), "expected cosine or cyclic_cosine or module"),
+        (lambda: _schedule(50, 2, warmup_steps=100), "steps is 100, expected less"),
         (
-            lambda: make_optimizer(TrainOptions(optimizer="lion"), lambda _: 1e-3),
-            r"config\.train\.optimizer is 'lion', expected adamw or module:function",
-        ),
-        (
-            lambda: _schedule_of("linear"),
-            "expected cosine or cyclic_cosine or module:f",
-        ),
-        (
-            lambda: _schedule(50, 2, warmup_steps=100),
-            "warmup_steps is 100, expected less than the 100",
-        ),
-        (
-            lambda: check_patterns(PARAMS, ("image*", "neck*")),
+            lambda: check_patterns(PARAMS, ("neck*",)),
             r"'neck\*', .*: backbone/w, image/w$",
         ),
     ],

@@ -1,21 +1,14 @@
 """One step: what it changes, what it leaves, and that devices do not matter."""
 
-from typing import Any
-
 import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from radejax.training.step import (
-    create_state,
-    make_optimizer,
-    make_train_step,
-)
+from radejax.training.step import create_state, make_optimizer, make_train_step
 
 RNG = jax.random.key(7)
-Tiny = Any  # the fixture `tiny` of conftest.py
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +26,7 @@ def step(tiny, start):
     return jax.jit(make_train_step(tiny.model, start[0], tiny.map_grid, **options))
 
 
-def _batch(tiny: Tiny, count: int = 4) -> Any:
+def _batch(tiny, count=4):
     return jax.tree.map(lambda x: x[:count], tiny.frames)
 
 
@@ -69,13 +62,11 @@ def test_a_step_without_finite_loss_changes_nothing_and_is_counted(tiny, start, 
 def test_bfloat16_keeps_parameters_moments_and_losses_in_float32(tiny, start):
     optimizer, state = start
     model = tiny.model.clone(options=tiny.model.options.replace(dtype="bfloat16"))
-    narrow = make_train_step(
-        model, optimizer, tiny.map_grid, loss=tiny.config.loss, ema_decay=0.9
-    )
+    options = {"loss": tiny.config.loss, "ema_decay": 0.9}
+    narrow = make_train_step(model, optimizer, tiny.map_grid, **options)
     after, metrics = jax.eval_shape(narrow, state, _batch(tiny), RNG)
-    floats = [
-        x.dtype for x in jax.tree.leaves(after) if jnp.issubdtype(x.dtype, jnp.floating)
-    ]
-    assert set(floats) == {jnp.dtype("float32")}
+    types = {x.dtype for x in jax.tree.leaves(after)}
+    floats = {dtype for dtype in types if jnp.issubdtype(dtype, jnp.floating)}
+    assert floats == {jnp.dtype("float32")}
     losses = ("loss", "focal", "gwd", "smooth_l1", "grad_norm")
     assert {metrics[name].dtype for name in losses} == {jnp.dtype("float32")}

@@ -7,24 +7,21 @@ float32 sums alone does to the authors' code there.
 
 import json
 import zlib
-from collections.abc import Callable, Mapping
-from typing import Any
 
 import jax
 import numpy as np
 import pytest
 
 from radejax import models
-from radejax.config import Config, load_config
+from radejax.config import load_config
 from radejax.core import devices
-from radejax.core.structures import Batch, DetectionMaps
+from radejax.core.structures import Batch
 from radejax.geometry.boxes import boxes8_from_7
 from radejax.geometry.camera import stack_cameras
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.inference.saved import load_torch
 from radejax.models.vit import ViT
 from radejax.training.step import (
-    TrainState,
     create_state,
     make_optimizer,
     make_schedule,
@@ -38,21 +35,19 @@ SEED = 1234
 LOSSES = ("focal", "gwd", "smooth_l1", "grad_norm")
 STEPS_PER_EPOCH = 3
 
-Measured = dict[str, np.ndarray]
-
 
 @pytest.fixture(scope="module")
-def file(golden) -> Measured:
+def file(golden):
     return dict(np.load(golden / "trajectory.npz"))
 
 
-def of_training(file: Measured, kind: str) -> Measured:
+def of_training(file, kind):
     """The arrays of one of the two trainings."""
     prefix = f"{kind}/"
     return {k.removeprefix(prefix): v for k, v in file.items() if k.startswith(prefix)}
 
 
-def cube_of(frame: int, boxes: np.ndarray, classes: np.ndarray) -> np.ndarray:
+def cube_of(frame, boxes, classes):
     """The cube `[101, 256, 107]` in which each object is a spot with channels of its class."""
     rng = np.random.default_rng([SEED, 950 + frame])
     cube = 0.45 + 0.1 * rng.random((101, 256, 107), dtype=np.float32)
@@ -69,12 +64,12 @@ def cube_of(frame: int, boxes: np.ndarray, classes: np.ndarray) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def frames(file) -> Batch:
+def frames(file):
     """The six frames, float32 as the authors' network sees them."""
     boxes, classes = file["boxes"], file["classes"].astype(np.int32)
-    cubes = np.stack(
-        [cube_of(i, boxes[i][x >= 0], x[x >= 0]) for i, x in enumerate(classes)]
-    )
+    kept = classes >= 0
+    parts = [(boxes[i][rows], classes[i][rows]) for i, rows in enumerate(kept)]
+    cubes = np.stack([cube_of(i, *part) for i, part in enumerate(parts)])
     assert zlib.crc32(cubes.tobytes()) == file["radenet/cube_crc32"]
     return Batch(
         projection=np.ascontiguousarray(np.moveaxis(cubes, 1, -1)),
@@ -86,9 +81,7 @@ def frames(file) -> Batch:
     )
 
 
-def train(
-    config: Config, model: Any, variables: Any, batch: Batch, num_steps: int
-) -> tuple[TrainState, Measured]:
+def train(config, model, variables, batch, num_steps):
     """State after batches of two in order, and what each step measured."""
     num_epochs = -(-num_steps // STEPS_PER_EPOCH)
     options = config.train.replace(batch_size=2, num_epochs=num_epochs)
@@ -96,17 +89,11 @@ def train(
     optimizer = make_optimizer(options, schedule)
     grid = models.map_grid(RadarGrid.kradar(), model, config.data.azimuth_mapping)
     mesh = devices.make_mesh(1)
-    state = create_state(
-        variables,
-        optimizer,
-        use_ema=False,
-        model=model,
-    )
+    state = create_state(variables, optimizer, use_ema=False, model=model)
     placement = devices.state_sharding(state, mesh, "replicated")
     state = jax.device_put(state, placement)
-    step = make_train_step(
-        model, optimizer, grid, loss=config.loss, decoding=config.decode
-    )
+    options = {"loss": config.loss, "decoding": config.decode}
+    step = make_train_step(model, optimizer, grid, **options)
     step = jax.jit(step, donate_argnums=0, out_shardings=(placement, None))
     measured, rng = [], jax.random.key(1)
     for i in range(num_steps):
@@ -115,14 +102,11 @@ def train(
         state, metrics = step(state, devices.put_batch(part, mesh), rng)
         rate = schedule(np.int32(i))
         measured.append({"lr": rate} | {name: metrics[name] for name in LOSSES})
-    return state, {
-        name: np.array([float(m[name]) for m in measured]) for name in measured[0]
-    }
+    columns = ([float(x) for x in row.values()] for row in measured)
+    return state, dict(zip(measured[0], np.array([*columns]).T, strict=True))
 
 
-def check_steps(
-    measured: Measured, fixture: Mapping[str, np.ndarray], limits: np.ndarray
-) -> None:
+def check_steps(measured, fixture, limits):
     """Rates are float32's of the recorded ones, losses within relative limits."""
     np.testing.assert_allclose(measured["lr"], fixture["lr"], rtol=1.2e-7)
     for name in LOSSES:
@@ -132,13 +116,7 @@ def check_steps(
         assert (found < limit).all(), (name, found)
 
 
-def check_maps(
-    maps: DetectionMaps,
-    fixture: Mapping[str, np.ndarray],
-    *,
-    heatmap: float,
-    regression: float,
-) -> None:
+def check_maps(maps, fixture, *, heatmap, regression):
     """Maps of the first frame at the end, every 16th row and 8th column."""
     for name, limit, found in (
         ("heatmap", heatmap, jax.nn.sigmoid(maps.heatmap_logits)),
@@ -148,11 +126,7 @@ def check_maps(
         np.testing.assert_allclose(found, fixture[name], atol=limit, rtol=0)
 
 
-def check_stats(
-    tensors: Mapping[str, np.ndarray],
-    fixture: Mapping[str, np.ndarray],
-    limits: tuple[float, float, float],
-) -> None:
+def check_stats(tensors, fixture, limits):
     """Mean, standard deviation and largest magnitude of tensors at the end."""
     of_name = dict(zip(map(str, fixture["names"]), fixture["stats"], strict=True))
     for name, value in tensors.items():
@@ -166,10 +140,8 @@ def check_stats(
 def test_radenet_trains_as_released(file, frames, make):
     config = load_config("radenet:official")
     model = models.build(config.model)
-    tensors = {
-        n: make.seeded_tensor(n, s)
-        for n, s in radenet_torch.torch_shapes(model).items()
-    }
+    shapes = radenet_torch.torch_shapes(model)
+    tensors = {n: make.seeded_tensor(n, s) for n, s in shapes.items()}
     variables = load_torch(tensors).variables
     state, measured = train(config, model, variables, frames, 12)
     maps = jax.jit(model.apply)(state.eval_variables, frames.projection[:1])
@@ -182,11 +154,7 @@ def test_radenet_trains_as_released(file, frames, make):
     check_stats(trained, fixture, (2e-5, 2e-5, 1.5e-4))
 
 
-def by_torch_name(
-    load: Callable[[Mapping[str, np.ndarray]], Any],
-    tensors: Mapping[str, np.ndarray],
-    variables: Any,
-) -> dict[str, np.ndarray]:
+def by_torch_name(load, tensors, variables):
     """The numbers of every tensor that a loader puts into variables, in no order.
 
     Told by loading tensors of their own positions.
@@ -195,17 +163,15 @@ def by_torch_name(
     marked = {n: np.full(tensors[n].shape, i, np.float32) for i, n in enumerate(names)}
     tree = load(marked)
     assert jax.tree.structure(tree) == jax.tree.structure(variables)
-    position, value = (
-        np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(t)])
-        for t in (tree, variables)
-    )
+    leaves = (map(np.ravel, jax.tree.leaves(x)) for x in (tree, variables))
+    position, value = (np.concatenate([*arrays]) for arrays in leaves)
     order = np.argsort(position, kind="stable")
     ends = np.searchsorted(position[order], np.arange(len(names) + 1))
     parts = {n: value[order[ends[i] : ends[i + 1]]] for i, n in enumerate(names)}
     return {name: part for name, part in parts.items() if part.size}
 
 
-def images(fixture: Mapping[str, np.ndarray], model: Any, variables: Any) -> np.ndarray:
+def images(fixture, model, variables):
     """The six frames' images as the frozen backbone sees them."""
     embed = jax.jit(lambda image: model.apply(variables, image, method="embed"))
     features = []
@@ -217,11 +183,9 @@ def images(fixture: Mapping[str, np.ndarray], model: Any, variables: Any) -> np.
     embedded, index = np.stack(features), fixture["token_index"]
     patches = embedded.reshape(len(features), -1, embedded.shape[-1])
     after = 5  # the class token and four registers
-    np.testing.assert_allclose(
-        patches[:, index[index >= after] - after],
-        fixture["tokens"][:, index >= after],
-        atol=2e-5,
-    )
+    found = patches[:, index[index >= after] - after]
+    expected = fixture["tokens"][:, index >= after]
+    np.testing.assert_allclose(found, expected, atol=2e-5)
     return embedded
 
 

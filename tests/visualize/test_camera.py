@@ -8,23 +8,18 @@ from radejax.core.structures import Boxes
 from radejax.geometry.camera import CameraCalibration
 from radejax.visualize import camera
 
+from .. import small_models as small
+
 # Looks along +x from the ego origin: u = 64 - 100 y / x, v = 36 - 100 z / x.
-CALIBRATION = CameraCalibration(
-    intrinsics=np.array([100.0, 100.0, 64.0, 36.0]),
-    distortion=np.zeros(5),
-    rotation=np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]),
-    translation_m=np.zeros(3),
-    width=128,
-    height=72,
-    radar_from_lidar_m=np.zeros(3),
-)
+INTRINSICS = (100.0, 100.0, 64.0, 36.0)
+CALIBRATION = small.forward_camera(intrinsics=INTRINSICS, width=128, height=72)
 IMAGE = np.zeros((72, 128, 3), np.uint8)
 BOX = [12.0, 1.0, 0.0, 4.0, 2.0, 1.0, 0.0]
 BEHIND = [-12.0, *BOX[1:]]
 FAR = [60.0, *BOX[1:]]  # 2 of 72 pixels high
 
 
-def segments_of(ax) -> np.ndarray:
+def segments_of(ax):
     lines = [c for c in ax.collections if hasattr(c, "get_segments")]
     return np.array(lines[-1].get_segments())
 

@@ -10,7 +10,6 @@ from matplotlib.collections import LineCollection, PathCollection, QuadMesh
 
 from radejax.core.errors import UserError
 from radejax.core.structures import Boxes
-from radejax.geometry.camera import CameraCalibration
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.visualize import draw, style
 from radejax.visualize.style import COLOR_MAP, Scene, save_figure
@@ -21,14 +20,14 @@ GRID = RadarGrid.reduced(num_doppler=4, num_range=60, num_elevation=3, num_azimu
 ROI = (0.0, 72.0, -16.0, 16.0, -2.0, 7.6)
 
 
-def scene(range_idx: int = 20, azimuth_idx: int = 20, **fields) -> Scene:
+def scene(range_idx=20, azimuth_idx=20, **fields):
     """Scene with one echo."""
     projection = np.full(GRID.projection_shape, 0.2, np.float32)
     projection[range_idx, azimuth_idx, 2] = 0.6
     return Scene(projection, GRID, **fields)
 
 
-def brightest_tile(figure, ax) -> np.ndarray:
+def brightest_tile(figure, ax):
     """Center, in display coordinates, of the pixels in the strongest color."""
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
@@ -55,12 +54,9 @@ def test_box_is_drawn_on_its_echo(range_idx, azimuth_idx):
 
 
 def test_a_scan_of_360_degrees_is_drawn_whole():
-    grid = dataclasses.replace(
-        GRID,
-        azimuth_rad=np.linspace(-np.pi, np.pi, 36, endpoint=False),
-        fov_azimuth_rad=np.pi,
-        fov_range_m=118.0,
-    )
+    azimuth_rad = np.linspace(-np.pi, np.pi, 36, endpoint=False)
+    fov = {"fov_azimuth_rad": np.pi, "fov_range_m": 118.0}
+    grid = dataclasses.replace(GRID, azimuth_rad=azimuth_rad, **fov)
     truth = Boxes.one_frame([-15.0, 0.0, 0.0, 4.0, 2.0, 1.5, 0.0], ["Sedan"])
     projection = np.zeros(grid.projection_shape, np.float32)
     drawn = Scene(projection, grid, ground_truth=truth)
@@ -69,9 +65,8 @@ def test_a_scan_of_360_degrees_is_drawn_whole():
     FigureCanvasAgg(bev.figure).draw()
     assert "−100" in [t.get_text() for t in bev.get_yticklabels()]
     (bar,) = bev.child_axes
-    x_m, power, range_m = (
-        ax.yaxis.label.get_window_extent() for ax in (bev, bar, polar)
-    )
+    labels = [ax.yaxis.label for ax in (bev, bar, polar)]
+    x_m, power, range_m = (label.get_window_extent() for label in labels)
     assert x_m.x0 > 0
     assert power.x1 < range_m.x0
     lines = [c for c in polar.collections if isinstance(c, LineCollection)]
@@ -168,15 +163,8 @@ def test_drawing_leaves_pyplot_alone_and_works_in_threads(tmp_path):
 def test_lidar_points_are_drawn_on_their_pixels():
     points_m = np.array([[10.0, 1.0, 0.5], [-10.0, 0, 0], [10.0, 90.0, 0]])
     image = np.zeros((72, 128, 3), np.uint8)
-    camera = CameraCalibration(
-        rotation=np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]),
-        translation_m=np.zeros(3),
-        intrinsics=np.array([100.0, 100.0, 64.0, 36.0]),
-        distortion=np.zeros(5),
-        width=128,
-        height=72,
-        radar_from_lidar_m=np.zeros(3),
-    )
+    size = {"width": 128, "height": 72}
+    camera = small.forward_camera(intrinsics=(100.0, 100.0, 64.0, 36.0), **size)
     shown = scene(image=image, camera=camera, lidar_m=points_m)
     (ax,) = (ax for ax in draw.draw_frame(shown).axes if ax.images)
     (scatter,) = (x for x in ax.collections if isinstance(x, PathCollection))
@@ -203,15 +191,11 @@ def test_map_shows_every_bin_of_a_partial_extent():
 
 SMALL = RadarGrid.reduced(num_doppler=4, num_range=6, num_elevation=3, num_azimuth=5)
 # The digits of a value are its place: range, azimuth, channel.
-PROJECTION = (
-    0.1 * np.arange(6)[:, None, None]
-    + 0.01 * np.arange(5)[None, :, None]
-    + 0.001 * np.arange(7)
-).astype(np.float32)
-SLICED = Scene(PROJECTION, SMALL)
+PROJECTION = np.einsum("irac,i->rac", np.indices((6, 5, 7)), [0.1, 0.01, 0.001])
+SLICED = Scene(PROJECTION.astype(np.float32), SMALL)
 
 
-def planes(figure) -> list[np.ndarray]:
+def planes(figure):
     return [ax.findobj(QuadMesh)[0].get_array() for ax in figure.axes[:3]]
 
 

@@ -11,7 +11,7 @@ from radejax.visualize import recordings
 from radejax.visualize.style import PREDICTION, Scene, new_figure
 
 
-def color_figure(color: str):
+def color_figure(color):
     figure = new_figure(0.5, 0.4, dpi=100)
     figure.set_facecolor(color)
     return figure
@@ -19,9 +19,8 @@ def color_figure(color: str):
 
 def test_gif_has_every_frame_in_order(tmp_path):
     colors = ["white", PREDICTION.color, "black"]
-    path = recordings.animate(
-        (color_figure(c) for c in colors), tmp_path / "a.gif", frames_per_second=5
-    )
+    figures = map(color_figure, colors)
+    path = recordings.animate(figures, tmp_path / "a.gif", frames_per_second=5)
     with Image.open(path) as gif:
         assert gif.n_frames == 3
         assert gif.info["duration"] == 200
@@ -49,7 +48,7 @@ GRID = RadarGrid.reduced(num_doppler=4, num_range=16, num_elevation=3, num_azimu
 BOX = [20.0, 3.0, 0.0, 4.0, 2.0, 1.5, 0.4]
 
 
-def frame(index: int) -> Scene:
+def frame(index):
     projection = np.full(GRID.projection_shape, 0.2, np.float32)
     projection[5, 3, 0] = projection[5, 3, GRID.num_doppler + 2] = 0.6
     return Scene(

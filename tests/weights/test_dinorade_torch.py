@@ -16,11 +16,7 @@ from radejax.models.lifting import reference_points
 from radejax.models.options import OFFICIAL_DINORADE, ViTOptions
 from radejax.models.vit import ViT
 from radejax.weights import dinorade_torch, dinov3_hf
-from radejax.weights.convert import (
-    to_torch_layout,
-    torch_name,
-    variable_shapes,
-)
+from radejax.weights.convert import to_torch_layout, torch_name, variable_shapes
 
 from .. import small_models
 
@@ -72,18 +68,13 @@ def test_loading_fills_the_model_exactly(seeded):
     fusion = model.options.fusion
     assert (fusion.num_heads, fusion.num_points) == (8, 2)
     reference = jax.eval_shape(released_geometry)
-    expected = jax.eval_shape(
-        model.init,
-        jax.random.key(0),
-        jnp.zeros((1, 256, 107, 101)),
-        jnp.zeros((1, 720, 1280, 3), jnp.uint8),
-        reference,
-    )
+    image = jnp.zeros((1, 720, 1280, 3), jnp.uint8)
+    inputs = jnp.zeros((1, 256, 107, 101)), image, reference
+    expected = jax.eval_shape(model.init, jax.random.key(0), *inputs)
     expected = dict(expected["params"]), expected["batch_stats"]
     del expected[0]["image_backbone"]
-    chex.assert_trees_all_equal_shapes(
-        (variables["params"], variables["batch_stats"]), expected
-    )
+    found = variables["params"], variables["batch_stats"]
+    chex.assert_trees_all_equal_shapes(found, expected)
 
 
 @pytest.fixture
@@ -143,8 +134,7 @@ def test_other_content_is_rejected(tiny, monkeypatch):
 
 def test_resnet_in_place_of_the_transformer(seeded, make):
     """Its names are those of torchvision's in the released Sequential."""
-    tensors = seeded
-    tensors = {n: v for n, v in tensors.items() if not n.startswith("image_neck.")}
+    tensors = {n: v for n, v in seeded.items() if not n.startswith("image_neck.")}
     config = load_config("dinorade:official,rcw_resnet50").model
     model = build(config)
     shapes = variable_shapes(model)

@@ -16,10 +16,8 @@ STAGE = {"block": np.arange(2.0)}
 
 @pytest.fixture
 def resnet(monkeypatch):
-    part = {
-        "params": {"image_backbone": TRUNK, "image_neck": STAGE},
-        "batch_stats": {"image_neck": STAGE},
-    }
+    part = {"params": {"image_backbone": TRUNK, "image_neck": STAGE}}
+    part["batch_stats"] = {"image_neck": STAGE}
     monkeypatch.setattr(image_backbone, "load_resnet", lambda path, model: part)
     return build(load_config("dinorade:rcw_resnet50").model)
 
@@ -57,11 +55,8 @@ def test_dinov2_small_has_the_sizes_of_its_config():
     model = build(load_config("dinorade:rcw_dinov2").model)
     # facebook/dinov2-small: 14 x 14 pixels per patch, pretrained at 518 x 518 pixels.
     assert model.options.image.feature_shape == (51, 91, 384)
-    shapes = jax.eval_shape(
-        ViT(model.options.image).init,
-        jax.random.key(0),
-        np.zeros((1, 28, 28, 3), np.float32),
-    )
+    vit, image = ViT(model.options.image), np.zeros((1, 28, 28, 3), np.float32)
+    shapes = jax.eval_shape(vit.init, jax.random.key(0), image)
     count = sum(leaf.size for leaf in jax.tree.leaves(shapes))
     # 22,056,576 parameters, of which a mask token and the biases of the keys are not needed.
     assert count == 22_056_576 - (1 + 12) * 384

@@ -30,10 +30,8 @@ def test_reads_torchs_files_exactly(released, torchs_file):
     nested = torch_file.read(torchs_file("nested_checkpoint"))
     assert nested["epoch"] == 3
     mixed = torch_file.read(torchs_file("mixed_dtypes"))
-    for found, name in (
-        (nested["model"], "channel_attention"),
-        (mixed, "mixed_dtypes"),
-    ):
+    files = {"channel_attention": nested["model"], "mixed_dtypes": mixed}
+    for name, found in files.items():
         expected = released(f"torch_expected/{name}")
         assert found.keys() == expected.keys()
         for key, value in found.items():

@@ -42,20 +42,17 @@ def test_everything_that_is_wrong_is_named(root, caplog):
     path = tesseracts / "tesseract_00005.mat"
     path.write_bytes(path.read_bytes()[:-5])
     (tesseracts / "tesseract_00006.mat").unlink()
-    write.write_tesseract(
-        tesseracts / "tesseract_00007.mat", np.ones((2, 3, 4, 5), np.float32)
-    )
+    other = np.ones((2, 3, 4, 5), np.float32)
+    write.write_tesseract(tesseracts / "tesseract_00007.mat", other)
     (root / "1/info_label/00008_00005.txt").write_text("nothing")
     with open(root / "1/info_label/00009_00006.txt", "a") as file:
         file.write("*, R, 9, Sedan, 1, 2\n")
     write.write_calibration(root / "2/info_calib/calib_radar_lidar.txt", 9, -2.5, 0.25)
     (root / "1/info_calib/calib_radar_lidar.txt").write_text("x\n1\n")
     (root / "1/description.txt").write_text("fog")
-    write.write_splits(
-        root / "split",
-        [(1, f"{i + 3:05d}_{i:05d}") for i in range(1, 7)],
-        [(1, "00004_00001"), (1, "00099_00096")],
-    )
+    train = [(1, f"{i + 3:05d}_{i:05d}") for i in range(1, 7)]
+    test = [(1, "00004_00001"), (1, "00099_00096")]
+    write.write_splits(root / "split", train, test)
     report = check_dataset([root])
     assert report.summary.problem_counts() == {
         "label file": 1,

@@ -26,28 +26,20 @@ def sedan(x, y, visibility="R", cls="Sedan"):
 
 
 def test_offset_and_filters(tmp_path):
-    write_frame(
-        tmp_path,
-        [
-            sedan(10.0, 1.0),
-            sedan(20.0, 1.0, "L"),
-            sedan(30.0, 1.0, "LL"),
-            sedan(2.0, 1.0),  # x = -0.5 in the radar frame
-            sedan(12.5, 20.0),  # 63 degrees to the left
-            sedan(120.5, 0.0),  # 118.0003 m away
-            sedan(40.0, 1.0, cls="Pedestrian Group"),
-            sedan(50.0, -2.0, cls="Bicycle"),
-        ],
-    )
+    labels = [sedan(10.0, 1.0), sedan(20.0, 1.0, "L"), sedan(30.0, 1.0, "LL")]
+    labels += [
+        sedan(2.0, 1.0),  # x = -0.5 in the radar frame
+        sedan(12.5, 20.0),  # 63 degrees to the left
+        sedan(120.5, 0.0),  # 118.0003 m away
+    ]
+    labels += [sedan(40.0, 1.0, cls="Pedestrian Group"), sedan(50, -2, cls="Bicycle")]
+    write_frame(tmp_path, labels)
     path = tmp_path / "1/info_calib/calib_radar_lidar.txt"
     write.write_calibration(path, 3, -2.5, 0.25)
     data = KRadar(tmp_path)
     (frame,) = data
-    np.testing.assert_allclose(
-        frame.boxes,
-        [[7.5, 1.25, 0.5, 4, 2, 1.5, 0.25], [47.5, -1.75, 0.5, 4, 2, 1.5, 0.25]],
-        rtol=1e-15,
-    )
+    expected = [[x, y, 0.5, 4, 2, 1.5, 0.25] for x, y in ((7.5, 1.25), (47.5, -1.75))]
+    np.testing.assert_allclose(frame.boxes, expected, rtol=1e-15)
     assert frame.boxes.dtype == np.float64
     assert frame.classes.tolist() == ["Sedan", "Bicycle"]
     assert frame.radar_from_lidar_m == (-2.5, 0.25, 0.0)
@@ -65,9 +57,8 @@ def test_offset_and_filters(tmp_path):
 
 def test_filters_can_be_changed(tmp_path):
     write_frame(tmp_path, [sedan(2.0, 1.0, "L1"), sedan(9, 0, cls="Bicycle Group")])
-    everything = KRadar(
-        tmp_path, visibility=None, classes=LABEL_CLASSES, field_of_view=False
-    )
+    every = {"visibility": None, "classes": LABEL_CLASSES, "field_of_view": False}
+    everything = KRadar(tmp_path, **every)
     assert len(everything[0].boxes) == 2
     assert everything[0].columns["visibility"].tolist() == ["L1", "R"]
     write.write_calibration(tmp_path / "1/info_calib/calib_radar_lidar.txt", 3, 5.0, -1)
@@ -161,11 +152,8 @@ def test_parsed_objects_equal_the_reference(shared, tmp_path):
         if not case["calibrated"]:
             write.write_calibration(path, 32, 0.0, 0.0)
         shutil.copy(folder / case["file"], root / "1/info_label/00033_00001.txt")
-        (frame,) = KRadar(
-            root,
-            version=case["version"],
-            visibility=("R",) if case["radar_only"] else ("R", "L"),
-        )
+        visibility = ("R",) if case["radar_only"] else ("R", "L")
+        (frame,) = KRadar(root, version=case["version"], visibility=visibility)
         boxes, classes, flags = frame.boxes, frame.classes, frame.columns["visibility"]
         if case["narrow_roi_filter"]:
             x, y, z = boxes[:, :3].T
@@ -191,11 +179,10 @@ def test_published_counts_of_the_training_split(shared):
     ahead = (x >= 0) & (x <= 72)
     narrow = ahead & (abs(y) <= 6.4) & (z >= -2) & (z <= 6)
     wide = ahead & (abs(y) <= 16) & (z >= -2) & (z <= 7.6)
-    for region, counts in (
-        (narrow, [19782, 4177, 1813, 160, 565]),
-        (wide, [25089, 5154, 2304, 190, 586]),
-    ):
-        assert [int((classes[region] == cls).sum()) for cls in CLASSES] == counts
+    found = [
+        [(classes[part] == cls).sum() for cls in CLASSES] for part in (narrow, wide)
+    ]
+    assert found == [[19782, 4177, 1813, 160, 565], [25089, 5154, 2304, 190, 586]]
     assert sum(len(frame.boxes) > 0 for frame in data) == 14593
     assert data.counts["sequences with the default calibration"] == 58
     assert data.summary().problem_counts() == {"object size": 3, "object twice": 11}

@@ -1,18 +1,11 @@
 import csv
 import dataclasses
-import pathlib
 import zipfile
 
 import pytest
 
 from radejax.core.errors import DataError, UserError
-from radejax.data.kradar import KRadar, folders, write
-from radejax.data.kradar.conditions import (
-    KRADAR_CONDITIONS,
-    WEATHERS,
-    Conditions,
-    read_description,
-)
+from radejax.data.kradar import KRadar, conditions, folders, write
 from radejax.data.kradar.folders import read_calibration, read_split
 from radejax.geometry.radar_grid import RadarGrid
 
@@ -29,7 +22,7 @@ def open_sequence(root, number=1, **options):
     return KRadar(root, **options)
 
 
-def touch(path: pathlib.Path, text: str = "x") -> pathlib.Path:
+def touch(path, text="x"):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
     return path
@@ -57,15 +50,11 @@ def test_own_labels_are_in_the_order_of_their_numbers(tmp_path):
     assert list(found) == [(1, "00009_00006"), (1, "00010_00007")]
 
 
-@pytest.mark.parametrize(
-    "layout",
-    [
-        "{}/{}.txt",
-        "KRadar_revised_visibility/{}/{}.txt",
-        "{}_info_label_revised/{}.txt",
-        "labels/{}/info_label/{}.txt",
-    ],
-)
+LAYOUTS = ("{}/{}.txt", "KRadar_revised_visibility/{}/{}.txt")
+LAYOUTS += ("{}_info_label_revised/{}.txt", "labels/{}/info_label/{}.txt")
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("zipped", [False, True])
 def test_label_revisions_in_their_layouts(tmp_path, layout, zipped):
     names = [layout.format(12, LABEL), layout.format(3, LABEL), "readme.txt"]
@@ -120,9 +109,7 @@ def test_one_bad_member_leaves_the_others(tmp_path):
     assert "labels.zip/1/00005_00002.txt: more than 262144 bytes" in bomb
     assert "labels.zip/1/00006_00003.txt: corrupted" in encrypted
     path.write_bytes(path.read_bytes()[:-30])
-    with pytest.raises(
-        DataError, match=r"labels\.zip: corrupted, not a folder or a zip"
-    ):
+    with pytest.raises(DataError, match=r"labels\.zip: corrupted, not a folder or a"):
         KRadar(labels=path)
 
 
@@ -218,8 +205,7 @@ def test_grid_of_the_roots(tmp_path):
     write.write_grid(b, dataclasses.replace(grid, fov_range_m=50.0))
     with pytest.raises(DataError, match="datasets of different sensors"):
         KRadar([a, b])
-    broken = ('{"range_m": 3}', "[" * 100_000, "9" * 5000, '{"range_m": 1e400}', "1")
-    for text in broken:
+    for text in ('{"range_m": 3}', "[" * 100_000, "9" * 5000, '{"range_m": 1e400}'):
         touch(b / "radar_grid.json", text)
         with pytest.raises(DataError, match=r"radar_grid\.json"):
             KRadar(b)
@@ -231,12 +217,11 @@ def test_grid_of_the_roots(tmp_path):
 def test_conditions_of_the_published_sequences(shared):
     with open(shared / "data/kradar/sequences.csv") as file:
         rows = {int(row["seq"]): row for row in csv.DictReader(file)}
-    names = ("environment", "time", "weather")
-    assert {
-        number: Conditions(*[row[name] for name in names])
-        for number, row in rows.items()
-    } == KRADAR_CONDITIONS
-    assert {row["weather"] for row in rows.values()} == set(WEATHERS)
+    for number, row in rows.items():
+        published = row["environment"], row["time"], row["weather"]
+        assert conditions.KRADAR_CONDITIONS[number] == conditions.Conditions(*published)
+    assert rows.keys() == conditions.KRADAR_CONDITIONS.keys()
+    assert {row["weather"] for row in rows.values()} == set(conditions.WEATHERS)
 
 
 @pytest.mark.parametrize(
@@ -244,7 +229,7 @@ def test_conditions_of_the_published_sequences(shared):
     [
         (read_calibration, "frame difference,x,y\n", ":2: '', expected three"),
         (read_calibration, "h\n1,2", ":2: '1,2', expected three numbers"),
-        (read_description, "", ":1: '', expected 'environment"),
+        (conditions.read_description, "", ":1: '', expected 'environment"),
         (read_split, "1,00033_00001.txt\n1;x", ":2: '1;x', expected"),
     ],
 )
@@ -261,7 +246,7 @@ def test_readers_accept_what_is_on_the_disks(tmp_path):
     path.write_bytes(b"frame difference,x,y\r\n 32, -2.54, 0.3\r\n")
     assert read_calibration(path) == (32, -2.54, 0.3)
     path.write_text("Urban, Day ,Normal")
-    assert read_description(path).environment == "urban"
+    assert conditions.read_description(path).environment == "urban"
     path.write_text("1,00033_00001.txt\n2,00034_00002.txt")
     assert read_split(path) == [(1, "00033_00001"), (2, "00034_00002")]
 

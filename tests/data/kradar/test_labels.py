@@ -51,9 +51,8 @@ def test_one_object_of_every_version(parse, version):
 
 def test_headers_of_the_data_set_and_of_the_annotation_tool(parse):
     header = parse(HEADER).header
-    assert header == LabelHeader(
-        pytest.approx(1643292946.710046, abs=1e-6), 33, 1, 2, 3, 4
-    )
+    time_s = pytest.approx(1643292946.710046, abs=1e-6)
+    assert header == LabelHeader(time_s, 33, 1, 2, 3, 4)
     text = (
         "* radar idx: 00857, lidar idx: 00834, camera idx: 02499, time: 1643184534.69,"
         f" prev lidar idx: -1, sequence: 9\r\n*, 0, -1, Sedan, {BOX}"

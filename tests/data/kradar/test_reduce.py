@@ -38,15 +38,13 @@ def test_frames_are_those_of_the_tensors(kradar_root, tmp_path, release):
         polar = reduce_tensor(read_tesseract(full.tesseract_path), data.grid)
         if release == "rpc":
             polar = strongest_points(polar, data.grid, 0.2, is_axis_up=True)
-        assert frame.radar_path == root / str(frame.sequence) / (
-            f"{release}_{frame.header.radar:05d}.npy"
-        )
+        name = f"{release}_{frame.header.radar:05d}.npy"
+        assert frame.radar_path == root / str(frame.sequence) / name
         stored = np.load(frame.radar_path)
         np.testing.assert_array_equal(stored, polar)
         assert stored.dtype == np.float64
-        np.testing.assert_array_equal(
-            frame.read_projection(data.grid), project_reduced(polar, data.grid)
-        )
+        projection = frame.read_projection(data.grid)
+        np.testing.assert_array_equal(projection, project_reduced(polar, data.grid))
 
 
 def test_writing_resumes_and_lists_corrupted_tensors(kradar_root, tmp_path):
@@ -72,9 +70,7 @@ def test_writing_resumes_and_lists_corrupted_tensors(kradar_root, tmp_path):
     assert (again.num_found, again.num_written, len(again.skipped)) == (9, 1, 2)
     with pytest.raises(UserError, match=r"rate is 1\.5, expected"):
         reduce_dataset([source], out, "rpc", 1.5)
-    with pytest.raises(
-        UserError, match=r"other reduced frames: .*release is 'polar3d' the"
-    ):
+    with pytest.raises(UserError, match=r"other reduced frames: .*release is 'polar3d"):
         reduce_dataset([source], out, "rpc")
     with pytest.raises(UserError, match=r"no radar_tesseract/\*\.mat in"):
         reduce_dataset([out], tmp_path / "again", "rpc")

@@ -61,9 +61,8 @@ def project_by_loops(power, doppler, grid, is_cell):
 @pytest.mark.parametrize("order", ["C", "F"])
 def test_power_and_doppler_are_those_of_kradar(golden, order):
     stored = np.load(golden / "reduced_releases.npz")
-    grid = RadarGrid.reduced(
-        num_doppler=64, num_range=20, num_elevation=2, num_azimuth=2
-    )
+    sizes = {"num_range": 20, "num_elevation": 2, "num_azimuth": 2}
+    grid = RadarGrid.reduced(num_doppler=64, **sizes)
     grid = dataclasses.replace(grid, doppler_mps=KRADAR.doppler_mps)
     found = reduce_tensor(np.asarray(stored["tesseract"], order=order), grid)
     assert found.dtype == np.float64
@@ -144,18 +143,16 @@ def test_points_agree_with_loops_in_both_layouts(seed, rate):
     is_ahead = older[:, :3].any(axis=1)
     assert is_ahead.all() == (points[:, 8] > 0).all()
     if is_ahead.any():
-        np.testing.assert_array_equal(
-            project_reduced(older, GRID), project_reduced(points[is_ahead], GRID)
-        )
+        expected = project_reduced(points[is_ahead], GRID)
+        np.testing.assert_array_equal(project_reduced(older, GRID), expected)
 
 
 def test_noise_lies_below_its_maximum_by_the_documented_shift():
     grid = dataclasses.replace(GRID, doppler_mps=KRADAR.doppler_mps)
     tensor = make_tensor(grid=grid)
     mean = project_reduced(reduce_tensor(tensor, grid), grid)[..., 64:].mean()
-    assert project_tensor(tensor)[..., 64:].mean() - mean == pytest.approx(
-        0.037, abs=0.002
-    )
+    of_maxima = project_tensor(tensor)[..., 64:].mean()
+    assert of_maxima - mean == pytest.approx(0.037, abs=0.002)
 
 
 def test_arrays_are_recognized_by_shape():

@@ -86,9 +86,7 @@ def test_whole_sequences_are_held_out_by_number_or_by_a_drawn_share():
     assert drawn[0] == drawn[1] != drawn[2]
     assert held_out(reversed(here), (0.1,), 0) == drawn[0]
     assert len(held_out([3, 4, 5], (0.1,), 0)) == 1  # never none
-    with pytest.raises(
-        UserError, match=r"holds out sequences \[7\], .*there are \[3, 4"
-    ):
+    with pytest.raises(UserError, match=r"holds out sequences \[7\], .*there are \[3,"):
         held_out([3, 4], (3, 7), 0)
     for all_of_them in ((3, 4), (0.9,)):
         with pytest.raises(UserError, match="leave at least one"):

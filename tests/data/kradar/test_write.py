@@ -5,21 +5,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from radejax.data.kradar import conditions, folders, write
-from radejax.data.kradar.labels import (
-    LABEL_CLASSES,
-    VERSIONS,
-    Label,
-    read_label_file,
-)
+from radejax.data.kradar.labels import LABEL_CLASSES, VERSIONS, Label, read_label_file
 
-position = st.floats(-200, 200)
-extent = st.floats(1e-3, 40)
+position, extent = [st.floats(-200, 200)] * 3, [st.floats(1e-3, 40)] * 3
 labels = st.builds(
     Label,
     st.sampled_from(LABEL_CLASSES),
-    st.tuples(
-        position, position, position, extent, extent, extent, st.floats(-8.0, 8.0)
-    ),
+    st.tuples(*position, *extent, st.floats(-8.0, 8.0)),
     st.sampled_from(["R", "L", "L1", "LL"]),
     st.integers(-1, 500),
 )
@@ -47,9 +39,8 @@ def test_calibration_description_and_splits_survive(tmp_path):
     write.write_calibration(tmp_path / "c.txt", 32, -2.54, np.float64(0.3))
     assert folders.read_calibration(tmp_path / "c.txt") == (32, -2.54, 0.3)
     write.write_description(tmp_path / "d.txt", "urban", "night", "heavysnow")
-    assert conditions.read_description(tmp_path / "d.txt") == conditions.Conditions(
-        "urban", "night", "heavysnow"
-    )
+    expected = conditions.Conditions("urban", "night", "heavysnow")
+    assert conditions.read_description(tmp_path / "d.txt") == expected
     write.write_splits(tmp_path, [(1, "00033_00001")], [(2, "00034_00002")])
     assert folders.read_split(tmp_path / "train.txt") == [(1, "00033_00001")]
     assert folders.read_split(tmp_path / "test.txt") == [(2, "00034_00002")]

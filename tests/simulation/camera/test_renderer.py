@@ -104,9 +104,8 @@ class TestLabelsProjectOntoObjects:
         calibration = CameraCalibration.from_kradar(tmp_path / "cam.yml")
         read = read_labels(tmp_path / "1.txt")[0]
         assert read.visibility == "R"
-        pixels, _ = calibration.project_ego(
-            corners(read.box) + calibration.radar_from_lidar_m
-        )
+        seen = corners(read.box) + calibration.radar_from_lidar_m
+        pixels, _ = calibration.project_ego(seen)
         mask = camera.CameraRenderer(sequence, FULL).shown_boxes(frame, 0)
         np.testing.assert_allclose(mask_bounds(mask, 0), bounds(pixels), atol=1.5)
 
@@ -128,9 +127,8 @@ class TestGround:
         ground = camera.trace_ground(PAIR[0], -0.9)
         index = np.arange(0, len(ground.x_m), 997)
         near = index[ground.depth_m[index] < 60.0]
-        points = np.stack(
-            [ground.x_m[near], ground.y_m[near], np.full(len(near), -0.9)], 1
-        )
+        x_m, y_m = ground.x_m[near], ground.y_m[near]
+        points = np.stack([x_m, y_m, np.full(len(near), -0.9)], 1)
         pixels, _ = PAIR[0].project_ego(points)
         v, u = np.nonzero(ground.hits)
         np.testing.assert_allclose(pixels[:, 0], u[near] + 0.5, atol=0.05)
@@ -167,12 +165,8 @@ class TestImage:
         _, image, _ = self.render("rain")
         _, clear, _ = self.render("rain", cover_lens=False)
         changed = np.abs(image.astype(int) - clear.astype(int)).max(-1) > 8
-        low, high = {
-            "clear": (0.0, 0.0),
-            "partial": (0.08, 0.5),
-            "heavy": (0.5, 0.95),
-            "full": (0.8, 1.0),
-        }[level]
+        limits = {"clear": (0.0, 0.0), "partial": (0.08, 0.5), "heavy": (0.5, 0.95)}
+        low, high = limits.get(level, (0.8, 1.0))
         assert low <= changed.mean() <= high
 
 
@@ -180,19 +174,17 @@ class TestSilhouettes:
     def test_oracle_shows_only_objects_in_class_colors_brighter_when_nearer(self):
         boxes = [[40.0, 4.0, -0.15, 4.5, 1.9, 1.5, 0.2], POSES[2][1], POSES[4][1]]
         options, images = SimulationOptions(camera_mode="oracle"), []
+        names = ["Sedan", "Sedan", "Pedestrian"]
         for time, weather in (("day", "normal"), ("night", "heavysnow")):
-            sequence = make_scene(
-                boxes, ["Sedan", "Sedan", "Pedestrian"], time=time, weather=weather
-            )
+            sequence = make_scene(boxes, names, time=time, weather=weather)
             renderer = camera.CameraRenderer(sequence, options)
             frame = sequence.frame(0)
             images.append(renderer.render(frame))
         image, mask = images[0], renderer.shown_boxes(frame, 0)
         np.testing.assert_array_equal(images[1], image)
         np.testing.assert_array_equal(image[:, :320].any(-1), mask >= 0)
-        far, near, person = (
-            np.unique(image[:, :320][mask == i], axis=0) for i in range(3)
-        )
+        left = image[:, :320]
+        far, near, person = (np.unique(left[mask == i], axis=0) for i in range(3))
         assert len(far) == len(near) == len(person) == 1  # flat
         origin = camera.shapes.camera_position(renderer.calibrations[0])
         for color, channel, box in ((far, 0, 0), (near, 0, 1), (person, 2, 2)):

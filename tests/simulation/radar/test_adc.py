@@ -26,14 +26,8 @@ PARAMETERS = tensor.RadarParameters(azimuth_elements=12.0, elevation_elements=1.
 def _both(radar, scatterers, noise):
     grid = radar.make_grid()
     samples = simulate_adc(scatterers, noise, tensor.frame_key(1), radar)
-    rows = tensor.simulate(
-        scatterers,
-        noise,
-        tensor.frame_key(2),
-        grid=grid,
-        parameters=PARAMETERS,
-        output="tesseract",
-    )
+    options = {"grid": grid, "parameters": PARAMETERS, "output": "tesseract"}
+    rows = tensor.simulate(scatterers, noise, tensor.frame_key(2), **options)
     expected = np.asarray(rows).transpose(tensor.TESSERACT_OF_ROWS)
     return np.asarray(adc_to_power(samples, radar)), expected
 

@@ -40,12 +40,14 @@ def make_frame(boxes, cls, velocity=None, *, index=0, tracks=None, reflectors=No
 
 
 def centers_of(cls, count=1, seed=0):
-    index = CLASSES.index(cls)
-    return scattering.make_object_scatterers(
-        np.full(count, index),
-        np.tile(SIZES[cls], (count, 1)),
-        np.random.default_rng(seed),
-    )
+    return centers_of_all([cls] * count, seed)
+
+
+def centers_of_all(names, seed=0):
+    classes = np.array([CLASSES.index(name) for name in names], int)
+    sizes = np.array([SIZES[name] for name in names]).reshape(-1, 3)
+    rng = np.random.default_rng(seed)
+    return scattering.make_object_scatterers(classes, sizes, rng)
 
 
 class TestCrossSection:
@@ -83,9 +85,7 @@ class TestCrossSection:
         np.testing.assert_allclose(flat, 1.0)
 
     def test_no_objects(self):
-        nothing = scattering.make_object_scatterers(
-            np.zeros(0, int), np.zeros((0, 3)), np.random.default_rng(0)
-        )
+        nothing = centers_of_all([])
         found, lit = scattering.scatter_objects(make_frame([], []), nothing, PARAMETERS)
         assert len(found.power) == len(lit) == 0
 
@@ -94,11 +94,7 @@ def test_car_behind_a_truck_is_weak_and_unlit():
     truck = [15.0, 0.0, 0.6, 9.0, 2.5, 3.0, 0.0]
     car = [30.0, 0.0, -0.1, 4.6, 1.9, 1.5, 0.0]
     names = ["Bus or Truck", "Sedan"]
-    centers = scattering.make_object_scatterers(
-        np.array([CLASSES.index(name) for name in names]),
-        np.array([SIZES[name] for name in names]),
-        np.random.default_rng(0),
-    )
+    centers = centers_of_all(names)
     both = make_frame([truck, car], names)
     alone = make_frame([car], ["Sedan"], tracks=[1])
     hidden, lit = scattering.scatter_objects(both, centers, PARAMETERS)
@@ -121,9 +117,8 @@ def at(position_m, velocity_mps=(0.0, 0.0), power=1.0):
 class TestMotion:
     def test_range_rate_of_a_moving_target_seen_from_a_moving_ego(self):
         part = at([[30.0, 40.0, 0.0]], (2.0, 11.0))
-        seen = scattering.to_scatterers(
-            part, np.array([12.0, 0.0]), PARAMETERS.wavelength_m
-        )
+        ego = np.array([12.0, 0.0])
+        seen = scattering.to_scatterers(part, ego, PARAMETERS.wavelength_m)
         # (2 - 12, 11) . (0.6, 0.8) = -6 + 8.8
         assert seen.velocity_mps[0] == pytest.approx(2.8, abs=1e-5)
         assert seen.range_m[0] == pytest.approx(50.0)
@@ -161,9 +156,8 @@ def test_walls_flash_when_seen_straight_on_and_hide_behind_vehicles():
         np.array([np.pi, np.pi / 2]),  # facing us; parallel to the road
         np.full(2, REFLECTOR_KINDS.index("wall")),
     )
-    free = scattering.scatter_surroundings(
-        make_frame([], [], reflectors=reflectors), np.zeros(2), PARAMETERS
-    )
+    empty = make_frame([], [], reflectors=reflectors)
+    free = scattering.scatter_surroundings(empty, np.zeros(2), PARAMETERS)
     assert free.power[0] > 5.0 * free.power[1]
     truck = [10.0, 0.0, 0.0, 8.0, 2.5, 3.0, 0.0]
     frame = make_frame([truck], ["Bus or Truck"], reflectors=reflectors)

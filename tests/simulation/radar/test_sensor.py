@@ -46,11 +46,8 @@ class TestDraws:
     def test_frames_of_one_sequence_share_them_and_programs_are_shared_by_all(self):
         made, again = next(simulators(1)), next(simulators(1))
         assert made.drawn == again.drawn
-        states = (
-            made._state,
-            made.radar_input(made.sequence.frame(1)).state,
-            again._state,
-        )
+        given = made.radar_input(made.sequence.frame(1))
+        states = (made._state, given.state, again._state)
         phases = [state.elevation_phase_rad for state in states]
         np.testing.assert_array_equal(phases, [phases[0]] * 3)
         assert len({m.parameters for m in simulators(3)}) == 1  # static arguments
@@ -84,10 +81,9 @@ class TestNoise:
 
     def test_gain_of_the_receiver_moves_noise_and_echoes(self):
         sensors = RadarParameters(), RadarParameters(receiver_db=10.0)
-        given = [
-            propagation.noise_profile("rain", GRID, s, np.zeros(2)) for s in sensors
-        ]
-        np.testing.assert_allclose(given[1], 10.0 * given[0], rtol=1e-5)
+        still = np.zeros(2)
+        low, high = (propagation.noise_profile("rain", GRID, s, still) for s in sensors)
+        np.testing.assert_allclose(high, 10.0 * low, rtol=1e-5)
 
     def test_leak_is_in_the_doppler_bin_of_velocity_zero(self):
         power = sensor.receiver_noise(GRID, RadarParameters(range_profile=1.0))
@@ -110,9 +106,8 @@ class TestLeakage:
     def test_mean_level_is_as_wanted_and_the_peak_remains(self, elements):
         beams = np.linspace(-0.9, 0.9, 91)
         basis = tensor.array_basis(beams, elements, 0.5)
-        parameters = RadarParameters(
-            azimuth_elements=elements, leakage=0.04, array_pedestal=0.5
-        )
+        fields = {"leakage": 0.04, "array_pedestal": 0.5}
+        parameters = RadarParameters(azimuth_elements=elements, **fields)
         power = []
         for seed in range(100):
             state = sensor.draw_state(GRID, parameters, np.random.default_rng(seed))
@@ -130,13 +125,9 @@ class TestLeakage:
         basis = tensor.array_basis(np.arcsin(sines), 48.0, 0.2)
 
         def pattern(index):
-            angle, phases = (
-                np.float32([np.arcsin(sines[index])]),
-                state.azimuth_phase_rad,
-            )
-            return (
-                basis @ np.asarray(tensor.array_signal(angle, 48.0, 0.2, phases))[:, 0]
-            )
+            angle = np.float32([np.arcsin(sines[index])])
+            signal = tensor.array_signal(angle, 48.0, 0.2, state.azimuth_phase_rad)
+            return basis @ np.asarray(signal)[:, 0]
 
         np.testing.assert_allclose(pattern(30)[:-10], pattern(40)[10:], atol=1e-4)
 
@@ -144,14 +135,13 @@ class TestLeakage:
         parameters = RadarParameters(leakage=0.05)
         target = points(GRID.range_m[20], 0.2, 0.0, GRID.doppler_mps[3], 1e3)
         silence = np.zeros((64, 16), np.float32)
-        rows = [
-            tensor.simulate(
-                target, silence, tensor.frame_key(1), state,
-                grid=GRID, parameters=parameters, output="tesseract",
-            )
-            for state in (None, state_of(3, leakage=0.05))
-        ]  # fmt: skip
-        ideal, real = (np.asarray(r)[20].mean((0, 1)) for r in rows)
+        options = {"grid": GRID, "parameters": parameters, "output": "tesseract"}
+
+        def row(state):
+            given = target, silence, tensor.frame_key(1), state
+            return np.asarray(tensor.simulate(*given, **options))[20].mean((0, 1))
+
+        ideal, real = row(None), row(state_of(3, leakage=0.05))
         away = np.abs(GRID.azimuth_rad - 0.2) > np.deg2rad(10.0)
         levels = [10 * np.log10(np.median(r[away]) / r.max()) for r in (ideal, real)]
         assert levels[0] < -30.0
@@ -170,10 +160,9 @@ def test_high_pass_by_hand():
 class TestGroundClutter:
     def clutter(self, speed_mps, **changes):
         values = {"ground_clutter": 0.0004, "gain_db": 209.0, "noise_db": 109.0}
-        parameters = RadarParameters(**values | changes)
-        noise = propagation.noise_profile(
-            "normal", RadarGrid.kradar(), parameters, np.array([speed_mps, 0.0])
-        )
+        parameters, grid = RadarParameters(**values | changes), RadarGrid.kradar()
+        ego = np.array([speed_mps, 0.0])
+        noise = propagation.noise_profile("normal", grid, parameters, ego)
         return noise / 10.0**10.9 - 1.0  # above the noise
 
     def test_fills_the_zero_doppler_bins_near_a_standing_car(self):

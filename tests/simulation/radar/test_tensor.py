@@ -20,9 +20,8 @@ QUIET = np.zeros((32, 16), np.float32)
 
 def points(range_m, azimuth=0.0, elevation=0.0, velocity=0.0, amplitude=1.0):
     """Scatterers of equal length from numbers or lists; amplitude may be complex."""
-    columns = np.broadcast_arrays(
-        *map(np.atleast_1d, (range_m, azimuth, elevation, velocity, amplitude))
-    )
+    numbers = range_m, azimuth, elevation, velocity, amplitude
+    columns = np.broadcast_arrays(*map(np.atleast_1d, numbers))
     amplitude = columns[4].astype(complex)
     return tensor.Scatterers(
         *(c.astype(np.float32) for c in columns[:4]),
@@ -156,9 +155,8 @@ class TestNoise:
         rows = np.arange(4, 32, 4)
         place = GRID.range_m[rows], GRID.azimuth_rad[11], 0.0, GRID.doppler_mps[7]
         target, noise = points(*place, 10.0), np.ones((32, 16), np.float32)
-        cells = [
-            tesseract(target, noise=noise, seed=(i,))[7, rows, 4, 11] for i in range(22)
-        ]
+        tensors = [tesseract(target, noise=noise, seed=(i,)) for i in range(22)]
+        cells = [power[7, rows, 4, 11] for power in tensors]
         assert np.std(cells) == pytest.approx(20.0 * np.sqrt(0.5), rel=0.2)
 
 
@@ -186,9 +184,8 @@ def direct_tesseract(scatterers, grid, parameters):
     azimuth = angle(grid.azimuth_rad, given.azimuth_rad, 20)
     elevation = angle(grid.elevation_rad, given.elevation_rad, 12)
     amplitude = given.amplitude @ [1.0, 1j]
-    field = np.einsum(
-        "s,ds,rs,es,as->drea", amplitude, doppler, ranges, elevation, azimuth
-    )
+    axes = doppler, ranges, elevation, azimuth
+    field = np.einsum("s,ds,rs,es,as->drea", amplitude, *axes)
     return np.abs(field) ** 2
 
 
@@ -201,9 +198,8 @@ class TestOutputs:
             rng.normal(size=12) + 1j * rng.normal(size=12),
         )  # fmt: skip
         expected = direct_tesseract(scene, GRID, PARAMETERS)
-        np.testing.assert_allclose(
-            tesseract(scene), expected, atol=1e-4 * expected.max()
-        )
+        atol = 1e-4 * expected.max()
+        np.testing.assert_allclose(tesseract(scene), expected, atol=atol)
 
     NOISE = np.full((32, 16), 1e9, np.float32)
 
@@ -215,29 +211,21 @@ class TestOutputs:
             1e6 * (rng.normal(size=64) + 1j * rng.normal(size=64)),
         )  # fmt: skip
 
+    def projection(self, key):
+        options = {"grid": GRID, "parameters": PARAMETERS}
+        return tensor.simulate(self.scene(), self.NOISE, key, **options)
+
     def test_projection_equals_the_projected_tesseract(self):
         power = tesseract(self.scene(), noise=self.NOISE)
-        fused = tensor.simulate(
-            self.scene(),
-            self.NOISE,
-            tensor.frame_key(1),
-            grid=GRID,
-            parameters=PARAMETERS,
-        )
-        np.testing.assert_allclose(
-            fused, project_tensor(power.astype(np.float32)), rtol=0, atol=2e-6
-        )
+        fused = self.projection(tensor.frame_key(1))
+        expected = project_tensor(power.astype(np.float32))
+        np.testing.assert_allclose(fused, expected, rtol=0, atol=2e-6)
 
     def test_vmap_over_frames(self):
         keys = np.stack([tensor.frame_key(i) for i in range(2)])
 
-        def one(key):
-            return tensor.simulate(
-                self.scene(), self.NOISE, key, grid=GRID, parameters=PARAMETERS
-            )
-
-        batch = jax.vmap(one)(keys)
-        np.testing.assert_allclose(batch[1], one(keys[1]), atol=1e-5)
+        batch = jax.vmap(self.projection)(keys)
+        np.testing.assert_allclose(batch[1], self.projection(keys[1]), atol=1e-5)
 
     def test_dropping_the_weakest_scatterers_changes_little(self):
         few = PARAMETERS.replace(max_scatterers_per_row=40)

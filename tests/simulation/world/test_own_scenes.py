@@ -1,5 +1,6 @@
 """Own scenes: what the file says is what is simulated, and wrong files are named."""
 
+import csv
 import pathlib
 import re
 import runpy
@@ -13,11 +14,7 @@ from radejax.core.structures import CLASSES, Boxes
 from radejax.inference import detect_files
 from radejax.simulation.config import SimulationOptions
 from radejax.simulation.simulator import LabelSource
-from radejax.simulation.world.own_scenes import (
-    SceneObject,
-    read_scenes,
-    write_scenes,
-)
+from radejax.simulation.world.own_scenes import SceneObject, read_scenes, write_scenes
 
 PAGE = pathlib.Path(__file__).resolve().parents[3] / "docs" / "simulator.md"
 BOX = "4.5,1.9,1.6"
@@ -30,7 +27,7 @@ ROWS = [
 ]
 
 
-def write(folder: pathlib.Path, lines: list[str]) -> pathlib.Path:
+def write(folder, lines):
     path = folder / "scenes.csv"
     path.write_text("\n".join(lines) + "\n")
     return path
@@ -62,12 +59,9 @@ def test_a_scene_has_the_boxes_velocities_and_conditions_of_the_file(tmp_path):
 
 
 def test_what_is_written_is_read(tmp_path):
-    values = [row.split(",") for row in ROWS]
-    names = HEAD.split(",")
-    given = [
-        SceneObject(**{n: x for n, x in zip(names, row, strict=True) if x})
-        for row in values
-    ]
+    given = []
+    for row in csv.DictReader([HEAD, *ROWS]):
+        given.append(SceneObject(**{name: x for name, x in row.items() if x}))
     write_scenes(tmp_path / "again.csv", given)
     read = read_scenes(tmp_path / "again.csv")
     assert read == [given[1], given[2], given[0], given[3]]
@@ -75,9 +69,7 @@ def test_what_is_written_is_read(tmp_path):
 
 
 def test_predictions_are_scenes(tmp_path, caplog):
-    boxes = Boxes.one_frame(
-        np.array([[20.0, 1, 0, 4, 2, 1.5, 0.3]]), ["Sedan"], np.array([0.5])
-    )
+    boxes = Boxes.one_frame([[20.0, 1, 0, 4, 2, 1.5, 0.3]], ["Sedan"], [0.5])
     detect_files._write_csv(tmp_path / "boxes.csv", [boxes], ["3/00033_00001"])
     (one,) = read_scenes(tmp_path / "boxes.csv")
     assert one.numbers == (3, 33, 1)

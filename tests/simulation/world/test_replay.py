@@ -36,12 +36,9 @@ def labels_folder(tmp_path):
     for number in (3, 7):
         for i in range(NUM_FRAMES):
             name = f"{i + 31:05d}_{i + 1:05d}.txt"
-            write.write_labels(
-                folder / str(number) / name,
-                (i + 31, i + 1, i + 5, i + 9, i + 11),
-                1.6e9 + 0.1 * i,
-                boxes_at(i),
-            )
+            indices = (i + 31, i + 1, i + 5, i + 9, i + 11)
+            path, time_s = folder / str(number) / name, 1.6e9 + 0.1 * i
+            write.write_labels(path, indices, time_s, boxes_at(i))
     return folder
 
 
@@ -80,15 +77,10 @@ class TestScene:
         frame = scene.frame(7)
         relative = frame.velocity_mps - frame.ego_velocity_mps
         cls, ids = scene.tracks.label_cls, scene.tracks.track_id
-        found = {
-            (cls[t], int(ids[t])): v[0]
-            for t, v in zip(frame.track, relative, strict=True)
-        }
-        for track, velocity in (
-            (("Bus or Truck", 8), -18.0),
-            (("Sedan", 7), -10.0),
-            (("Pedestrian Group", 9), 0.0),
-        ):
+        tracks = zip(frame.track, relative, strict=True)
+        found = {(cls[t], int(ids[t])): v[0] for t, v in tracks}
+        expected = {("Bus or Truck", 8): -18, ("Sedan", 7): -10}
+        for track, velocity in (expected | {("Pedestrian Group", 9): 0}).items():
             assert found[track] == pytest.approx(velocity, abs=1e-4)
 
     def test_ego_speed_is_that_at_which_parked_cars_stand(self, source):
@@ -111,9 +103,8 @@ class TestScene:
 
 class TestWrittenTree:
     def test_labels_out_are_labels_in(self, labels_folder, tmp_path):
-        root = simulate_dataset(
-            make_config(labels_folder, sequences=[7]), tmp_path / "out", progress=False
-        )
+        config = make_config(labels_folder, sequences=[7])
+        root = simulate_dataset(config, tmp_path / "out", progress=False)
         written = sorted((root / "7" / "info_label_v2_1").iterdir())
         assert len(written) == NUM_FRAMES
         for i, path in enumerate(written):
@@ -141,27 +132,22 @@ class TestWrittenTree:
     @pytest.mark.parametrize("stride", [1, 2])
     @pytest.mark.parametrize("count", [1, 2, 3, 5, 9])
     def test_few_frames_are_in_both_splits(self, labels_folder, count, stride):
-        config = make_config(
-            labels_folder, frame_stride=stride, frames_per_sequence=count
-        )
-        source = LabelSource(config)
-        specs = source.frames(3)
+        whole = make_config(labels_folder, frame_stride=stride)
+        specs = LabelSource(whole.replace(frames_per_sequence=count)).frames(3)
         assert len(specs) == min(count, NUM_FRAMES // stride)
         assert {s.split for s in specs} == {"train", *["test"] * (count > 1)}
         chosen = [s.scene_idx for s in specs]
         assert set(np.diff(chosen)) <= {stride}
         if count > 4 // stride:  # more frames than in the first quarter
             assert chosen[0] == 0
-        whole = make_config(labels_folder, frame_stride=stride)
         all_specs = LabelSource(whole).frames(3)
         assert specs == [s for s in all_specs if s.scene_idx in chosen]
 
     def test_weather_is_that_of_the_description_beside_the_labels(self, labels_folder):
         config = make_config(labels_folder)
         assert LabelSource(config).conditions(7) == ("alleyway", "night", "normal")
-        write.write_description(
-            labels_folder / "7" / "description.txt", "urban", "day", "fog"
-        )
+        path = labels_folder / "7" / "description.txt"
+        write.write_description(path, "urban", "day", "fog")
         assert LabelSource(config).make(7).weather == "fog"
         (labels_folder / "7").rename(labels_folder / "70")  # not one of K-Radar's
         assert LabelSource(config).conditions(70) == ("urban", "day", "fog")
