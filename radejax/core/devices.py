@@ -180,7 +180,8 @@ def list_of_main(values: list[int]) -> list[int]:
     """
     count = int(multihost_utils.broadcast_one_to_all(np.int32(len(values))))
     own = values if is_main() else [0] * count
-    return multihost_utils.broadcast_one_to_all(np.asarray(own, np.int32)).tolist()
+    values = multihost_utils.broadcast_one_to_all(np.asarray(own, np.int32)).tolist()
+    return values
 
 
 @contextlib.contextmanager
