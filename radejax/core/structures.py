@@ -306,7 +306,8 @@ class Boxes:
 
         `decode` clips smaller sizes to this value by default.
         """
-        return self.box[:, 3:6].min(axis=1) <= np.float32(MIN_SIZE_M)
+        smallest: Float[np.ndarray, " N"] = self.box[:, 3:6].min(axis=1)
+        return smallest <= np.float32(MIN_SIZE_M)
 
     def take(self, rows: Shaped[np.ndarray, " K"]) -> Boxes:
         """Returns some of the boxes.

@@ -232,7 +232,8 @@ def camera_inputs(
             )
     views: list[tuple[Camera, tuple[int, int] | None]] = []
     missing: list[str] = []
-    known: dict[tuple[object, ...], tuple[Camera, tuple[int, int]]] = {}
+    known: dict[tuple[pathlib.Path, tuple[float, ...]], tuple[Camera, tuple[int, int]]]
+    known = {}
     for frame, image in zip(frames, sources, strict=True):
         path = frame.camera_calibration_path
         if image is None or path is None:

@@ -121,7 +121,8 @@ def _power_db(
     )
     require(is_same, "shape of the projection", projection.shape, expected)
     channels = slice(grid.num_doppler or None)
-    return projection[..., channels].max(-1) * LOG_SCALE_DB - LOG_OFFSET_DB
+    power_db: np.ndarray = projection[..., channels].max(-1) * LOG_SCALE_DB
+    return power_db - LOG_OFFSET_DB
 
 
 def _points_where(

@@ -370,7 +370,8 @@ def encode(
         encoding: One of `ENCODINGS`.
     """
     if encoding == "uint8":
-        return (np.clip(projection, 0.0, 1.0) * 255.0).round().astype(np.uint8)
+        levels: np.ndarray = np.clip(projection, 0.0, 1.0) * 255.0
+        return levels.round().astype(np.uint8)
     return projection.astype(encoding)
 
 

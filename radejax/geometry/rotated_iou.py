@@ -89,13 +89,14 @@ def iou_3d(
     ground_a = _footprint(xp, a)
     ground_b = _footprint(xp, b)
     area = _intersection(xp, ground_a, ground_b)
-    height_a = xp.maximum(a[..., 5], 0)
-    height_b = xp.maximum(b[..., 5], 0)
+    height_a: ArrayT = xp.maximum(a[..., 5], 0)
+    height_b: ArrayT = xp.maximum(b[..., 5], 0)
     # The difference of top and bottom may round to more than either height.
     shared = xp.minimum(shared_height(a, b, z_center), xp.minimum(height_a, height_b))
+    volume: ArrayT = area * shared
     volume_a = ground_a[2] * ground_a[3] * height_a
     volume_b = ground_b[2] * ground_b[3] * height_b
-    return _ratio(xp, area * shared, volume_a, volume_b)
+    return _ratio(xp, volume, volume_a, volume_b)
 
 
 def bev_intersection(
