@@ -155,7 +155,8 @@ class FmcwRadar(Options, section="radar"):
         flat = np.cos(up)
         toward = [flat * np.cos(right), -flat * np.sin(right), np.sin(up)]
         turns = self.virtual_m @ np.reshape(toward, (3, -1)) / self.wavelength_m
-        return np.exp(2j * np.pi * turns)
+        phases: np.ndarray = np.exp(2j * np.pi * turns)
+        return phases
 
     def windows(self) -> tuple[Window, Window, Window]:
         """Returns the weights of samples `[N]`, chirps `[D]` and virtual antennas `[TQ]`.
@@ -180,7 +181,8 @@ class FmcwRadar(Options, section="radar"):
 def _window(place: Float[np.ndarray, "n axes"], pedestal: float) -> Window:
     """Returns a window from -1/2 to 1/2, that of `simulation.radar.tensor.window_response`."""
     weights = (pedestal + (1 - pedestal) * np.cos(np.pi * place) ** 2).prod(1)
-    return (weights / np.linalg.norm(weights)).astype(np.float32)
+    normalized: Window = (weights / np.linalg.norm(weights)).astype(np.float32)
+    return normalized
 
 
 def adc_to_power(
@@ -222,7 +224,8 @@ def adc_to_power(
         require(found == radar.shape[1:3], "shape of calibration", found, expected)
     if not isinstance(samples, jax.core.Tracer):
         _check_values(np.asarray(samples))
-    return _to_power(samples, radar, calibration)
+    power: Float[jax.Array, "D R E A"] = _to_power(samples, radar, calibration)
+    return power
 
 
 def _check_values(samples: Num[np.ndarray, "D T Q N"]) -> None:
@@ -274,7 +277,8 @@ def _to_power(
         halves = product.reshape(grid.num_range, 2, *grid.shape_drea[2:])
         return jnp.square(halves).sum(1)
 
-    return lax.map(beams, signals)
+    power: Float[jax.Array, "D R E A"] = lax.map(beams, signals)
+    return power
 
 
 def read_ti_bin(

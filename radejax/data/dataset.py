@@ -443,7 +443,10 @@ def find_reader(name: str) -> type[LabeledFrames[LabeledFrame]]:
         UserError: There is no such name, or the class cannot be imported.
     """
     place = "radejax.data.kradar:KRadar" if name == "kradar" else name
-    return find_part(place, "config.data.format", {"kradar": None}, LabeledFrames)
+    reader: type[LabeledFrames[LabeledFrame]] = find_part(
+        place, "config.data.format", {"kradar": None}, LabeledFrames
+    )
+    return reader
 
 
 def held_out(

@@ -171,4 +171,5 @@ def local_mean_db(
     whole = uniform_filter(power, outer, mode="nearest") * outer**2
     guard = uniform_filter(power, inner, mode="nearest") * inner**2
     mean = (whole - guard) / (outer**2 - inner**2)
-    return 10.0 * np.log10(np.maximum(mean, 1e-10))
+    mean_db: np.ndarray = 10.0 * np.log10(np.maximum(mean, 1e-10))
+    return mean_db

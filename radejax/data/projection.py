@@ -161,7 +161,8 @@ def to_log_scale(
     """Converts linear power to the normalized decibels of the network input."""
     level: np.ndarray = np.log10(power + power.dtype.type(POWER_FLOOR))
     level *= 10.0 / LOG_SCALE_DB
-    return np.add(level, LOG_OFFSET_DB / LOG_SCALE_DB, out=out)
+    scaled: np.ndarray = np.add(level, LOG_OFFSET_DB / LOG_SCALE_DB, out=out)
+    return scaled
 
 
 def linear_power(
@@ -351,7 +352,8 @@ def unstack_frames(
         part.reshape(*part.shape[:-1], num_frames, part.shape[-1] // num_frames)
         for part in xp.split(stacked, [num_frames * num_doppler], axis=-1)
     ]
-    return xp.moveaxis(xp.concatenate(parts, -1), -2, -4)
+    frames: ArrayT = xp.moveaxis(xp.concatenate(parts, -1), -2, -4)
+    return frames
 
 
 ENCODINGS = ("float16", "uint8", "float32")

@@ -255,7 +255,8 @@ def embedding_fields(image_config: files.JsonObject) -> files.JsonObject:
     """Returns the part of `config.model.image` that embeddings depend on, in JSON types."""
     irrelevant = ("freeze", "attention", "layer_scale")
     relevant = {k: v for k, v in image_config.items() if k not in irrelevant}
-    return json.loads(json.dumps(relevant))
+    plain: files.JsonObject = json.loads(json.dumps(relevant))
+    return plain
 
 
 def describe_grid(grid: RadarGrid) -> str:

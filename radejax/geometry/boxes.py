@@ -83,7 +83,8 @@ def boxes8_from_7(boxes: Real[ArrayT, "*batch 7"]) -> Float[ArrayT, "*batch 8"]:
     xp = array_module(boxes)
     boxes = _checked(xp.asarray(boxes), 7)
     yaw = boxes[..., 6:7]
-    return xp.concatenate([boxes[..., :6], xp.sin(yaw), xp.cos(yaw)], -1)
+    converted: ArrayT = xp.concatenate([boxes[..., :6], xp.sin(yaw), xp.cos(yaw)], -1)
+    return converted
 
 
 def boxes7_from_8(boxes: Real[ArrayT, "*batch 8"]) -> Float[ArrayT, "*batch 7"]:
@@ -107,7 +108,8 @@ def boxes7_from_8(boxes: Real[ArrayT, "*batch 8"]) -> Float[ArrayT, "*batch 7"]:
     xp = array_module(boxes)
     boxes = _checked(xp.asarray(boxes), 8)
     yaw = xp.arctan2(boxes[..., 6:7], boxes[..., 7:8])
-    return xp.concatenate([boxes[..., :6], yaw], -1)
+    converted: ArrayT = xp.concatenate([boxes[..., :6], yaw], -1)
+    return converted
 
 
 def bev_corners(boxes: Real[ArrayT, "*batch _"]) -> Float[ArrayT, "*batch 4 2"]:
@@ -141,7 +143,8 @@ def bev_corners(boxes: Real[ArrayT, "*batch _"]) -> Float[ArrayT, "*batch 4 2"]:
     left = boxes[..., 4, None] / 2 * across
     x = boxes[..., 0, None] + cos * ahead - sin * left
     y = boxes[..., 1, None] + sin * ahead + cos * left
-    return xp.stack([x, y], -1)
+    ends: ArrayT = xp.stack([x, y], -1)
+    return ends
 
 
 def corners(boxes: Real[ArrayT, "*batch _"]) -> Float[ArrayT, "*batch 8 3"]:
@@ -166,7 +169,8 @@ def corners(boxes: Real[ArrayT, "*batch _"]) -> Float[ArrayT, "*batch 8 3"]:
     half = boxes[..., 5, None, None] / 2
     bottom = xp.concatenate([ground, center - half], -1)
     top = xp.concatenate([ground, center + half], -1)
-    return xp.concatenate([bottom, top], -2)
+    ends: ArrayT = xp.concatenate([bottom, top], -2)
+    return ends
 
 
 def _checked(boxes: ArrayT, width: int) -> ArrayT:

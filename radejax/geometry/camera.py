@@ -141,7 +141,8 @@ def stack_cameras(cameras: Sequence[Camera]) -> Camera:
         stacked = np.stack(leaves)
         return stacked if stacked.dtype == bool else stacked.astype(np.float32)
 
-    return jax.tree.map(stack, *cameras)
+    batch: Camera = jax.tree.map(stack, *cameras)
+    return batch
 
 
 def to_camera(
@@ -168,7 +169,8 @@ def to_camera(
     transform = xp.expand_dims(camera.cam_from_ego, axes)
     # Accelerators may compute a matrix product in reduced precision, unlike this sum.
     turned = xp.sum(transform[..., :3] * points[..., None, :], -1)
-    return turned + transform[..., 3]
+    moved: ArrayT = turned + transform[..., 3]
+    return moved
 
 
 def to_pixels(
@@ -206,7 +208,8 @@ def to_pixels(
     folds = square > xp.expand_dims(camera.max_radius, axes) ** 2
     x_seen = xp.where(folds, x * 1e3, x_seen)
     y_seen = xp.where(folds, y * 1e3, y_seen)
-    return xp.stack([fx * x_seen + cx, fy * y_seen + cy], -1)
+    pixels: ArrayT = xp.stack([fx * x_seen + cx, fy * y_seen + cy], -1)
+    return pixels
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -85,7 +85,8 @@ def values_at(axis: Float[np.ndarray, " bins"], position: PositionT) -> Position
         [0.0, 3.0, 6.0]
     """
     if is_uniform(axis):
-        return axis[0] + position * _step(axis)
+        values: PositionT = axis[0] + position * _step(axis)
+        return values
     return _interpolated(position, np.arange(axis.size), axis)
 
 
@@ -103,7 +104,8 @@ def _interpolated(x: PositionT, xs: np.ndarray, ys: np.ndarray) -> PositionT:
     left = xp.clip(left, 0, xs.size - 2)
     tables = xs, ys, np.diff(ys) / np.diff(xs)
     start, value, slope = (xp.asarray(table)[left] for table in tables)
-    return value + (x - start) * slope
+    interpolated: PositionT = value + (x - start) * slope
+    return interpolated
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -378,7 +380,8 @@ class RadarGrid(ArrayValues):
         range_m = values_at(self.range_m, range_bin)
         azimuth = values_at(self.azimuth_rad, azimuth_bin)
         y_m = -range_m * xp.sin(azimuth)
-        return xp.stack([range_m * xp.cos(azimuth), y_m], -1)
+        positions: ArrayT = xp.stack([range_m * xp.cos(azimuth), y_m], -1)
+        return positions
 
     def ego_to_bin(
         self, x_m: Number | Real[ArrayT, "*#bins"], y_m: Number | Real[ArrayT, "*#bins"]
@@ -411,7 +414,8 @@ class RadarGrid(ArrayValues):
         azimuth_bin = (azimuth - middle) * last / span + last / 2
         if not is_uniform(axis):
             azimuth_bin = _interpolated(azimuth, axis, np.arange(axis.size))
-        return xp.stack([range_bin, azimuth_bin], -1)
+        bins: ArrayT = xp.stack([range_bin, azimuth_bin], -1)
+        return bins
 
     def nearest_bin(
         self, x_m: Number | Real[ArrayT, "*#bins"], y_m: Number | Real[ArrayT, "*#bins"]
@@ -431,7 +435,8 @@ class RadarGrid(ArrayValues):
         xp = array_module(bins)
         last = xp.asarray([self.num_range - 1, self.num_azimuth - 1], bins.dtype)
         last = xp.broadcast_to(last, bins.shape)
-        return xp.clip(xp.round(bins), 0, last).astype(xp.int32)
+        nearest: ArrayT = xp.clip(xp.round(bins), 0, last).astype(xp.int32)
+        return nearest
 
     def bin_centers_ego(self) -> Float[np.ndarray, "R A 2"]:
         """Returns x and y of every range-azimuth bin center in meters, `[R, A, 2]` float64."""
@@ -504,4 +509,5 @@ class RadarGrid(ArrayValues):
         xp, (x_m, y_m) = as_floats(x_m, y_m)
         is_ahead = xp.abs(xp.arctan2(y_m, x_m)) <= self.fov_azimuth_rad
         is_near = xp.sqrt(x_m * x_m + y_m * y_m) <= self.fov_range_m
-        return is_ahead & is_near
+        is_inside: ArrayT = is_ahead & is_near
+        return is_inside

@@ -133,7 +133,8 @@ def shared_height(
     above, below = 1 - z_center, z_center
     top = xp.minimum(a[..., 2] + above * a[..., 5], b[..., 2] + above * b[..., 5])
     bottom = xp.maximum(a[..., 2] - below * a[..., 5], b[..., 2] - below * b[..., 5])
-    return xp.maximum(top - bottom, 0)
+    height: ArrayT = xp.maximum(top - bottom, 0)
+    return height
 
 
 def _all_pairs(a: ArrayT, b: ArrayT) -> tuple[types.ModuleType, ArrayT, ArrayT]:
@@ -215,7 +216,8 @@ def _intersection(
         inside = xp.maximum(b_high[j] - b_low[j], 0)
         twice_area = twice_area + inside * (b_half[j][0] + x * vy - y * vx)
     smaller = xp.minimum(a_length * a_width, b_length * b_width)
-    return xp.clip(twice_area / 2, 0, smaller)
+    area: ArrayT = xp.clip(twice_area / 2, 0, smaller)
+    return area
 
 
 def _ratio(
@@ -223,4 +225,5 @@ def _ratio(
 ) -> ArrayT:
     """Computes intersection over union, 0 where both boxes are empty."""
     union = size_a + size_b - shared
-    return shared / xp.where(union > 0, union, 1)
+    ratio: ArrayT = shared / xp.where(union > 0, union, 1)
+    return ratio

@@ -171,7 +171,8 @@ def read_frame(path: PathLike, grid: RadarGrid) -> Float[np.ndarray, "R A DE"]:
     """
     if pathlib.Path(path).suffix != ".npy":
         whole = project_file(path, shape_drea=grid.shape_drea)
-        return grid.measured_channels(whole)
+        projection: np.ndarray = grid.measured_channels(whole)
+        return projection
     if reduced.is_reduced_file(path):
         return reduced.project_reduced(read_npy(path, mapped=True), grid, str(path))
     projection = read_projection_npy(path, grid.projection_shape)
