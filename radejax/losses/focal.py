@@ -95,7 +95,8 @@ def gaussian_heatmap(
     # The barrier prevents the compiler from fusing the sum separately into each of its
     # uses. Rounding then differs, and a sum near 1 counts as positive in one use but not
     # in another (jax 0.10.0 on CPUs).
-    return jax.lax.optimization_barrier(jnp.minimum(heatmap, 1.0))
+    target: jax.Array = jax.lax.optimization_barrier(jnp.minimum(heatmap, 1.0))
+    return target
 
 
 def focal_loss(logits: Maps, target: Maps) -> Float[jax.Array, ""]:

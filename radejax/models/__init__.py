@@ -47,16 +47,20 @@ def options_class(name: str) -> type[RadeNetOptions]:
         UserError: There is no such model.
     """
     try:
-        return typing.get_type_hints(_model_class(name))["options"]
+        kind: type[RadeNetOptions] = typing.get_type_hints(_model_class(name))[
+            "options"
+        ]
     except NameError as error:
         raise UserError(
             f"config.model.name is {name!r}: {error}; import the types of its attributes "
             "outside of `if TYPE_CHECKING`"
         ) from None
+    return kind
 
 
 def _model_class(name: str) -> type[RadeNet]:
-    return find_part(name, "config.model.name", _MODELS, RadeNet)
+    model: type[RadeNet] = find_part(name, "config.model.name", _MODELS, RadeNet)
+    return model
 
 
 def has_camera(model: nn.Module) -> typing.TypeGuard[DinoRade]:

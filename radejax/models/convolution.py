@@ -87,7 +87,8 @@ def _backward(dilation: int, saved: Operands, grad: jax.Array) -> Operands:
 
     def plain(x: Inputs, grad: Outputs) -> Kernel:
         pull = jax.vjp(lambda k: plain_conv2d(x, k, dilation), kernel)[1]
-        return pull(grad)[0]
+        grad_kernel: jax.Array = pull(grad)[0]
+        return grad_kernel
 
     size, _, *channels = kernel.shape
     num_bins = x.shape[1] * x.shape[2]

@@ -214,7 +214,8 @@ def lifted_attention(
             return _lifted_head(chunk_sizes, (value, per_bin, tuple(biases)))
 
         by_head = (value, offsets, logits, offset_bias, logit_bias)
-        return jax.lax.map(head, by_head)
+        attention: jax.Array = jax.lax.map(head, by_head)
+        return attention
 
     arrays = (value, offsets, logits, *geometry)
     if b == 1:  # on a CPU, the gradient of a batch of one is slower
@@ -255,7 +256,8 @@ def _by_chunk(
     by_platform = {
         platform: functools.partial(function, size) for platform, size in chunk_sizes
     }
-    return jax.lax.platform_dependent(*arrays, **by_platform)
+    result: T = jax.lax.platform_dependent(*arrays, **by_platform)
+    return result
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(0,))
@@ -418,4 +420,5 @@ def _to_chunks(arrays: T, size: int) -> T:
         padded = jnp.pad(x, [(0, -bins % size)] + [(0, 0)] * (x.ndim - 1))
         return padded.reshape(-1, size, *x.shape[1:])
 
-    return jax.tree.map(split, arrays)
+    chunks: T = jax.tree.map(split, arrays)
+    return chunks

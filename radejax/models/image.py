@@ -206,7 +206,8 @@ class ResNetLayer(Layer, kw_only=True):
     ) -> jax.Array:
         if self.frozen:
             return FrozenBatchNorm(dtype=self.dtype, name=name)(x)
-        return batch_norm(name, self.dtype, train)(x, mask=mask)
+        y: jax.Array = batch_norm(name, self.dtype, train)(x, mask=mask)
+        return y
 
 
 class Bottleneck(ResNetLayer):

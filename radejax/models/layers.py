@@ -39,7 +39,8 @@ def uniform_fan_in(fan_in: int) -> Initializer:
         size = math.prod(shape)
         count = max(2**14, 4 ** math.ceil(math.log(size, 4)))
         numbers = jax.random.uniform(key, (count,), jnp.float32, -bound, bound)
-        return _cut(numbers, shape)
+        weights: jax.Array = _cut(numbers, shape)
+        return weights
 
     return init
 

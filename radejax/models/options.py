@@ -297,7 +297,8 @@ class QueryGridOptions(Options, section="config.model.query_grid"):
         axes = np.broadcast_arrays(x, y, np.sin(elevation))
         dtype = np.float64 if xp is np else np.float32
         unit = xp.asarray(np.stack(axes, -1)[None], dtype)
-        return xp.asarray(range_m.reshape(-1, 1, 1, 1), dtype) * unit
+        centers: Array = xp.asarray(range_m.reshape(-1, 1, 1, 1), dtype) * unit
+        return centers
 
 
 def azimuth_axis_deg(grid: RadarGrid) -> tuple[float, ...]:

@@ -85,7 +85,7 @@ class RadeNet(nn.Module):
         """Applies the backbone."""
         options = self.options
         backbone = find_part(options.backbone, "config.model.backbone", BACKBONES)
-        return self._part(backbone)(
+        features: Map = self._part(backbone)(
             doppler_bins=self.num_frames * options.doppler_bins,
             widths=options.widths,
             decoder_width=options.decoder_width,
@@ -93,6 +93,7 @@ class RadeNet(nn.Module):
             input_stem=options.input_stem,
             name="backbone",
         )(padded)
+        return features
 
     def _maps(
         self, features: Float[jax.Array, "B Rp Ap C"], projection: Projection

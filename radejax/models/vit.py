@@ -76,7 +76,8 @@ class ViT(Layer):
             length=options.num_layers,
         )
         tokens, _ = layers(options, self.dtype, name="layers")(tokens, rope)
-        return _layer_norm(rope, jnp.float32, "norm")(tokens)
+        normalized: Tokens = _layer_norm(rope, jnp.float32, "norm")(tokens)
+        return normalized
 
     def _embed(
         self, image: Float[jax.Array, "B H W 3"], rows: int, columns: int
@@ -189,7 +190,8 @@ def bicubic_weights(
         weights = weights[:, 2:-2] / weights[:, 2:-2].sum(1, keepdims=True)
     else:
         weights = weights @ np.eye(old)[samples.clip(0, old - 1)]
-    return weights.astype(np.float32)
+    rounded: np.ndarray = weights.astype(np.float32)
+    return rounded
 
 
 def rotary_angles(rows: int, columns: int, head_dim: int) -> Rope:
@@ -264,9 +266,10 @@ def attend(
         if is_half and jax.default_backend() == "gpu":  # tracing "cudnn" needs a GPU
             flash["cuda"] = functools.partial(plain, implementation="cudnn")
         # The choice is made at lowering, so that a traced program runs on each platform.
-        return jax.lax.platform_dependent(
+        out: PerHead = jax.lax.platform_dependent(
             query, key, value, cpu=_attend_blocked, default=plain, **flash
         )
+        return out
     if kind == "blocked":
         return _attend_blocked(query, key, value)
     return plain(query, key, value, implementation=kind)
@@ -294,7 +297,8 @@ def _attend_blocked(query: OfSample, key: OfSample, value: OfSample) -> OfSample
             total = weights.sum(0, keepdims=True)
             return ((values @ weights.astype(x.dtype)) / total).astype(x.dtype)
 
-        return jax.lax.map(one_block, blocks)
+        attended: jax.Array = jax.lax.map(one_block, blocks)
+        return attended
 
     # [heads, n, d, block]
     out: jax.Array = jax.lax.map(one_head, (queries, keys, values))

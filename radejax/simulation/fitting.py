@@ -89,7 +89,8 @@ def fit_files(
 
 def _mean_db(power: Tensor) -> Float[np.ndarray, "R A"]:
     mean = power.mean((0, 2), dtype=np.float64) + 1e-10
-    return 10.0 * np.log10(mean)
+    level: Float[np.ndarray, "R A"] = 10.0 * np.log10(mean)
+    return level
 
 
 def _simulated(section: files.JsonObject) -> Tensor:

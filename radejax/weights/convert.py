@@ -119,7 +119,8 @@ def from_torch(
     if problems:
         shown = "; ".join(problem[:160] for problem in sorted(problems)[:_SHOWN])
         raise DataError(f"{source} does not fit, {len(problems)} problems: {shown}")
-    return unflatten_dict(flat, sep="/")
+    variables: MutableVariableDict = unflatten_dict(flat, sep="/")
+    return variables
 
 
 def to_torch(rules: Rules, variables: VariableDict) -> dict[str, np.ndarray]:

@@ -141,7 +141,8 @@ def on_faces(faces: Quads, u: Spans, v: Spans) -> Quads:
     """
     u, v = u[:, [0, 1, 1, 0], None], v[:, [0, 0, 1, 1], None]  # [F, 4, 1]
     a, b, c, d = (faces[:, None, i] for i in range(4))
-    return (1 - v) * ((1 - u) * a + u * b) + v * ((1 - u) * d + u * c)
+    corners: Quads = (1 - v) * ((1 - u) * a + u * b) + v * ((1 - u) * d + u * c)
+    return corners
 
 
 _FACADES = np.array(

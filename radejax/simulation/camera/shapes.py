@@ -144,7 +144,8 @@ class Light(NamedTuple):
             beam = np.exp(-np.square(y_m / (2.0 + 0.16 * np.abs(x_m))))
             brightness = brightness + 0.75 * beam * np.exp(-np.abs(x_m) / 28.0)
         clear = np.exp(-self.extinction_per_m * depth_m)[..., None]
-        return color * brightness[..., None] * clear + self.veil * (1.0 - clear)
+        lit: Colors = color * brightness[..., None] * clear + self.veil * (1.0 - clear)
+        return lit
 
 
 def visible_polygons(
@@ -178,7 +179,8 @@ def visible_polygons(
 def camera_position(calibration: CameraCalibration) -> Point:
     """Returns the position of the camera in the radar frame."""
     to_ego = calibration.rotation.T
-    return calibration.radar_from_lidar_m - to_ego @ calibration.translation_m
+    origin: Point = calibration.radar_from_lidar_m - to_ego @ calibration.translation_m
+    return origin
 
 
 def _object_faces(

@@ -98,7 +98,8 @@ def attenuation(weather: str, distance_m: Cells) -> Cells:
     """Computes the factor on the received power by two-way attenuation and radome loss."""
     law = WEATHERS[weather]
     loss_db = 2.0 * law.attenuation_db_per_km * distance_m / 1000.0 + law.radome_db
-    return 10.0 ** (-loss_db / 10.0)
+    factor: Cells = 10.0 ** (-loss_db / 10.0)
+    return factor
 
 
 def noise_profile(
@@ -160,7 +161,8 @@ def _doppler_share(
     offset = np.mod(offset + period / 2, period) - period / 2
     spread = (offset[..., None] + folds) / (spread_mps or step / 2.0)
     density = np.exp(-0.5 * spread**2).sum(-1)
-    return (density / density.sum(-1, keepdims=True)).mean(0)
+    share: Float[np.ndarray, " D"] = (density / density.sum(-1, keepdims=True)).mean(0)
+    return share
 
 
 def reflection(
@@ -177,7 +179,10 @@ def reflection(
     """
     root = np.sqrt(surface.permittivity - (1.0 - sine**2))
     rough = 2.0 * np.pi * surface.roughness_m * sine / wavelength_m
-    return (sine - root) / (sine + root) * np.exp(-2.0 * rough**2)
+    coherent: Inexact[np.ndarray, "*targets"] = (
+        (sine - root) / (sine + root) * np.exp(-2.0 * rough**2)
+    )
+    return coherent
 
 
 def bounce(
@@ -203,4 +208,5 @@ def bounce(
     bounced = np.maximum(np.hypot(flat, height + radar_height), 1e-6)
     rho = reflection((height + radar_height) / bounced, surface, wavelength_m)
     turn = 2.0 * np.pi * (bounced - direct) / wavelength_m
-    return np.square(1.0 + rho * np.exp(1j * turn))
+    factor: Complex[np.ndarray, " S"] = np.square(1.0 + rho * np.exp(1j * turn))
+    return factor

@@ -260,7 +260,8 @@ def received_power(
     pattern = forward**parameters.pattern_exponent
     gain = 10.0 ** ((parameters.gain_db + parameters.receiver_db) / 10.0)
     passed = sensor.high_pass(distance, parameters.high_pass_m)
-    return gain * rcs_m2 * pattern / distance**4 * passed
+    power: Values = gain * rcs_m2 * pattern / distance**4 * passed
+    return power
 
 
 CAPACITY_STEP = 512

@@ -60,7 +60,10 @@ def receiver_noise(
     is_still[np.abs(grid.doppler_mps).argmin() if grid.num_doppler else 0] = 1.0
     leak = np.maximum(factor - 1.0, 0.0) * is_still.size
     level = 10.0 ** ((parameters.noise_db + parameters.receiver_db) / 10.0)
-    return level * (np.minimum(factor, 1.0)[:, None] + leak[:, None] * is_still)
+    power: Float[np.ndarray, "R D"] = level * (
+        np.minimum(factor, 1.0)[:, None] + leak[:, None] * is_still
+    )
+    return power
 
 
 def high_pass(

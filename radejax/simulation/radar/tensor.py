@@ -329,13 +329,15 @@ def simulate(
             return power
         maxima = jnp.concatenate([power.max(axis=0), power.max(axis=1)], axis=0).T
         levels = (10.0 * jnp.log10(maxima + POWER_FLOOR) + LOG_OFFSET_DB) / LOG_SCALE_DB
-        return grid.measured_channels(levels)  # [A, D+E]
+        measured: jax.Array = grid.measured_channels(levels)  # [A, D+E]
+        return measured
 
-    return lax.platform_dependent(
+    rows: Float[jax.Array, "..."] = lax.platform_dependent(
         (kept, in_range, noise_power, jnp.arange(grid.num_range, dtype=jnp.uint32)),
         cpu=functools.partial(lax.map, row),
         default=functools.partial(lax.map, row, batch_size=64),
     )
+    return rows
 
 
 def array_basis(

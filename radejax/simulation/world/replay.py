@@ -145,7 +145,8 @@ def infer_ego_speed(
     known = lower > 0.3 * usual  # slow vehicles ahead are weak evidence
     speed = np.where(known, lower, usual)
     speed = np.clip(speed, 0.0, np.maximum(np.minimum(upper, 40.0), 0.0))
-    return median_filter(speed, 21, mode="nearest")
+    smooth: Float[np.ndarray, " F"] = median_filter(speed, 21, mode="nearest")
+    return smooth
 
 
 def _ground_height(tracks: Tracks) -> float:

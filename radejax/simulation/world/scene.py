@@ -132,7 +132,8 @@ class SceneFrame:
         """Change of the boxes' x and y over time in the turning radar frame."""
         x_m, y_m = self.boxes[:, :2].T
         turning = self.ego_yaw_rate_radps * np.stack([-y_m, x_m], 1)
-        return self.velocity_mps - self.ego_velocity_mps - turning
+        relative: np.ndarray = self.velocity_mps - self.ego_velocity_mps - turning
+        return relative
 
 
 @dataclasses.dataclass(frozen=True)
@@ -243,7 +244,8 @@ def is_blocked(
     leave = np.maximum(near, far).min(-1)
     crosses = (enter < leave) & (leave > 0) & (enter < 1.0) & (enter > 0)
     crosses &= np.arange(len(boxes))[None] != owner[:, None]
-    return crosses.any(1)
+    blocked: Bool[np.ndarray, " S"] = crosses.any(1)
+    return blocked
 
 
 def turned(

@@ -131,7 +131,8 @@ class _Traffic:
 
     def _size(self, cls: str) -> Size:
         mean, deviation = np.array(SIZES[cls])
-        return mean + deviation * self.rng.normal(size=3).clip(-2, 2)
+        size: Size = mean + deviation * self.rng.normal(size=3).clip(-2, 2)
+        return size
 
     def _vehicle_class(self) -> str:
         law = self.law
