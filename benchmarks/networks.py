@@ -20,7 +20,7 @@ from radejax import models
 from radejax.config import load_config
 from radejax.data.pipeline import LoaderOptions, make_loader, make_table
 from radejax.geometry.radar_grid import RadarGrid
-from radejax.models.deformable_attention import DeformableAttention, Queries
+from radejax.models.deformable_attention import DeformableAttention
 from radejax.models.lifting import ReferencePoints, reference_points
 from radejax.models.vit import rotary_angles
 from radejax.training.step import create_state, make_optimizer, make_train_step
@@ -352,8 +352,7 @@ def attention(machine):
     def ours(params, feature, scale, places, value):
         module = DeformableAttention(*ATTENTION)
         mean = jnp.full(places.shape[:-1], 1 / elevation)
-        queries = Queries(scale, places, mean)
-        return module.apply({"params": params}, feature, queries, value)
+        return module.apply({"params": params}, feature, scale, places, mean, value)
 
     arrays = jax.device_put((params, *given))
     program, cost = compiled(ours, *arrays, precision="highest")

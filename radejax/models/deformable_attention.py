@@ -108,14 +108,18 @@ class DeformableAttention(Layer):
     def __call__(
         self,
         feature: Float[jax.Array, "B N C"],
-        queries: Queries,
+        scale: Float[jax.Array, "B N E"],
+        reference: Float[jax.Array, "#B N E 2"],
+        query_weights: Float[jax.Array, "#B N E"],
         value: Float[jax.Array, "B H W C"],
     ) -> Float[jax.Array, "B N C"]:
         """Computes the weighted sum of the attention of each bin's queries.
 
         Args:
             feature: `[B, N, C]` features of the bins.
-            queries: The E queries of the bins.
+            scale: `[B, N, E]` factors; query e of bin n is `scale[n, e] * feature[n]`.
+            reference: `[B or 1, N, E, 2]` reference points, (x, y) in 0..1.
+            query_weights: `[B or 1, N, E]` weights of the queries in the sum.
             value: `[B, H, W, C]` map to sample.
 
         Returns:
@@ -144,7 +148,7 @@ class DeformableAttention(Layer):
             value.reshape(*value.shape[:3], heads, -1),
             offsets.reshape(*batch, heads, points, 2),
             logits.reshape(*batch, heads, points),
-            queries,
+            Queries(scale, reference, query_weights),
             offset_bias.reshape(heads, points, 2),
             logit_bias.reshape(heads, points),
             chunk_size=self.chunk_size,
@@ -152,7 +156,7 @@ class DeformableAttention(Layer):
         # As the projection is linear, it is applied to the sum over the queries, with the
         # bias multiplied by the sum of their weights.
         out, bias = linear(name="output_proj")(out.reshape(*batch, -1))
-        total = queries.weights.sum(-1, keepdims=True)  # 0 for bins without a query
+        total = query_weights.sum(-1, keepdims=True)  # 0 for bins without a query
         return out + (total * jnp.expand_dims(bias, (0, 1))).astype(self.dtype)
 
     def _ring(self, _: jax.Array, shape: tuple[int, ...]) -> jax.Array:

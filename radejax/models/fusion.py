@@ -14,7 +14,7 @@ from jaxtyping import Float, Real
 
 from radejax.core.structures import Array
 from radejax.models import lifting
-from radejax.models.deformable_attention import DeformableAttention, Queries
+from radejax.models.deformable_attention import DeformableAttention
 from radejax.models.heads import DilatedNeck
 from radejax.models.layers import Dense, Map, Part
 from radejax.models.lifting import ReferencePoints
@@ -80,8 +80,8 @@ class Fusion(Part):
 
         counts = options.num_heads, options.num_points, options.chunk_size
         attention = DeformableAttention(c, *counts, dtype=self.dtype, name="attention")
-        queries = Queries(per_bin(scale), per_bin(reference.points), per_bin(mean))
-        seen = attention(per_bin(radar), queries, camera)
+        points = per_bin(reference.points)
+        seen = attention(per_bin(radar), per_bin(scale), points, per_bin(mean), camera)
         seen = seen.reshape(b, r, a, c)
         share = self._camera_share(radar, seen)
         has_camera = mean.sum(-1, keepdims=True) > 0  # bins with queries in the mean

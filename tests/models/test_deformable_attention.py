@@ -104,9 +104,8 @@ def test_reference_module_and_gradients(case_of, name, make):
 def test_initial_offsets_form_rings(released):
     expected = released("deform_attn")["initial_bias__d128_l1_h4_p8"]
     module = DeformableAttention(128, 4, 8)
-    queries = Queries(*map(jnp.zeros, [(1, 1, 1), (1, 1, 1, 2), (1, 1, 1)]))
-    inputs = jnp.zeros((1, 1, 128)), queries, jnp.zeros((1, 2, 2, 128))
-    params = jax.jit(module.init)(jax.random.key(0), *inputs)["params"]
+    shapes = (1, 1, 128), (1, 1, 1), (1, 1, 1, 2), (1, 1, 1), (1, 2, 2, 128)
+    params = jax.jit(module.init)(jax.random.key(0), *map(jnp.zeros, shapes))["params"]
     np.testing.assert_allclose(params["sampling_offsets"]["bias"], expected, atol=1e-5)
     for name in ("sampling_offsets", "attention_weights"):
         assert not params[name]["kernel"].any()
@@ -124,14 +123,12 @@ def lifted_case(shared_geometry, seed=0):
     batch = 1 if shared_geometry else B
     inputs = {
         "feature": rng.standard_normal((B, N, C)),
-        "queries": Queries(
-            rng.random((B, N, E)) * (rng.random((B, N, E)) > 0.3),
-            rng.uniform(-0.1, 1.1, (batch, N, E, 2)),
-            rng.random((batch, N, E)) * (rng.random((batch, N, E)) > 0.2),
-        ),
+        "scale": rng.random((B, N, E)) * (rng.random((B, N, E)) > 0.3),
+        "reference": rng.uniform(-0.1, 1.1, (batch, N, E, 2)),
+        "query_weights": rng.random((batch, N, E)) * (rng.random((batch, N, E)) > 0.2),
         "value": rng.standard_normal((B, H, W, C)),
     }
-    inputs = jax.tree.map(jnp.asarray, inputs)
+    inputs = {k: jnp.asarray(v) for k, v in inputs.items()}
     return module, random_params(rng, module), inputs, rng.standard_normal((B, N, C))
 
 
@@ -151,9 +148,8 @@ def random_params(rng, module):
 
 
 def through_plain_form(module, params, inputs):
-    queries = inputs["queries"]
-    query = queries.scale[..., None] * inputs["feature"][:, :, None]
-    points = jnp.broadcast_to(queries.reference, (B, N, E, 2))
+    query = inputs["scale"][..., None] * inputs["feature"][:, :, None]
+    points = jnp.broadcast_to(inputs["reference"], (B, N, E, 2))
     out, *_ = plain_attention(
         params["params"],
         query.reshape(B, N * E, C),
@@ -162,7 +158,7 @@ def through_plain_form(module, params, inputs):
         [(H, W)],
         (module.num_heads, module.num_points),
     )
-    weights = queries.weights[..., None]
+    weights = inputs["query_weights"][..., None]
     return (out.reshape(B, N, E, C) * weights).sum(2)
 
 
