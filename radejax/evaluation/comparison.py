@@ -29,9 +29,16 @@ from scipy.special import stdtrit
 from radejax.core import files
 from radejax.core.errors import UserError
 from radejax.core.files import JsonObject, PathLike
+from radejax.core.structures import Boxes
 from radejax.evaluation import protocols, report
 from radejax.evaluation.analysis import distance_sets
-from radejax.evaluation.boxes import Columns, frame_keys, take
+from radejax.evaluation.boxes import (
+    Columns,
+    frame_ids,
+    frame_keys,
+    frame_positions,
+    take,
+)
 from radejax.evaluation.evaluation_set import SPACES, EvaluationSet
 from radejax.evaluation.files import Source, load, options_for, report_folders
 from radejax.evaluation.results import (
@@ -264,16 +271,12 @@ def _holm(p_values: Sequence[float]) -> list[float]:
 
 
 def _check_same_truth(data_a: EvaluationSet, data_b: EvaluationSet) -> None:
-    """Raises a `UserError` unless both sets have the same classes, frames and objects.
-
-    Frames are compared by their positions, as their ids may differ.
-    """
+    """Raises a `UserError` unless both sets have the same classes, frames and objects."""
     for name, one, other in (
         ("classes", data_a.classes, data_b.classes),
-        ("frames", np.arange(data_a.frame.size), np.arange(data_b.frame.size)),
+        ("frames", data_a.frame, data_b.frame),
         ("objects", data_a.gt.box, data_b.gt.box),
         ("classes of objects", data_a.gt.cls, data_b.gt.cls),
-        ("frames of objects", data_a.gt.frame, data_b.gt.frame),
     ):
         if not np.array_equal(one, other):
             counts = f"{len(one)} and {len(other)}"
@@ -373,10 +376,11 @@ def compare_files(
     options = options_for(seeds, source, options)
     names = [str(path) for path in paths]
     first, frames = _load_run(folders[0], source, options)
-    others = [_load_run(run, source, options, frames)[0] for run in folders[1:]]
+    others = [_load_run(run, source, options, frames) for run in folders[1:]]
+    loaded = [(first, frames), *others]
     built = []
     rows = []
-    for i, sets in enumerate(others if options.bootstrap else [], 1):
+    for i, (sets, _) in enumerate(others if options.bootstrap else [], 1):
         found = compare(first, sets, frames, options)
         label = "comparison" if len(others) == 1 else f"comparison-{i}"
         counts = len(first), len(sets)
@@ -393,7 +397,7 @@ def compare_files(
         files.write_json(place.with_suffix(".json"), content)
         report.write_tables(place, built, is_simulated=is_simulated)
         if figures:
-            runs = dict(zip(short_names(paths), [first, *others], strict=True))
+            runs = dict(zip(short_names(paths), (x for x, _ in loaded), strict=True))
             _draw_curves(runs, options, pathlib.Path(out_dir), figures)
     return text, rows
 
@@ -452,13 +456,13 @@ def _load_run(
         folders: Report of each seed.
         source: Source of the ground truth.
         options: Settings of the evaluation.
-        like: Frame table whose order of the frames is taken, or None.
+        like: Frame table whose ids and order of the frames are taken, or None.
     """
     sets: dict[str, EvaluationSet] = {}
     for name, path in folders.items():
         truth, found, frames, _ = load(path, source, options.classes)
         if like is not None:
-            frames = _in_order_of(like, frames)
+            truth, found, frames = _renumbered(truth, found, frames, like)
         like = frames
         if "sequence" not in frames:
             raise UserError(
@@ -469,16 +473,26 @@ def _load_run(
     return sets, frames
 
 
-def _in_order_of(like: Columns, frames: Columns) -> Columns:
-    """Returns the frames in the order of another table.
+def _renumbered(
+    truth: Boxes, found: Boxes, frames: Columns, like: Columns
+) -> tuple[Boxes, Boxes, Columns]:
+    """Returns boxes and frame table with the frame ids and the order of another table.
 
     Frames are identified by their keys: ids differ if a run was evaluated on a part.
     """
-    keys = frame_keys(like)
-    row_of = {key: row for row, key in enumerate(frame_keys(frames))}
-    if other := sorted(row_of.keys() ^ set(keys)):
+    keys = frame_keys(frames)
+    ids = dict(zip(frame_keys(like), frame_ids(like), strict=True))
+    if other := sorted(set(keys) ^ set(ids)):
         raise UserError(
-            f"the runs have different frames ({len(keys)} and {len(row_of)}), such as "
+            f"the runs have different frames ({len(ids)} and {len(keys)}), such as "
             f"{other[0]}: choose common ones by --sequences, --weather or --split"
         )
-    return take(frames, np.array([row_of[key] for key in keys], np.int64))
+    new = np.array([ids[key] for key in keys], np.int64)
+    truth, found = (
+        dataclasses.replace(
+            table, frame=new[frame_positions(table.frame, frame_ids(frames), "boxes")]
+        )
+        for table in (truth, found)
+    )
+    order = [keys.index(key) for key in ids]
+    return truth, found, take({**frames, "frame": new}, np.array(order, np.int64))
