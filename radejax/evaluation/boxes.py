@@ -109,8 +109,7 @@ def columns_of_boxes(table: AnyBoxes) -> Columns:
 def read_boxes(table: AnyBoxes, name: str, *, scored: bool) -> Boxes:
     """Reads boxes from the columns frame, box, cls and, for predictions, score.
 
-    Further columns of one number or array of numbers per box become `extras`, such as
-    calibrated probabilities and what own metrics need. Others are ignored.
+    Further columns of numbers become `extras`.
 
     Args:
         table: Boxes, or columns by name.
@@ -133,12 +132,9 @@ def read_boxes(table: AnyBoxes, name: str, *, scored: bool) -> Boxes:
     box = columns["box"].astype(np.float64)
     box = box if frame.size else np.zeros((0, 7))  # an empty list has no width
     score = columns["score"].astype(np.float64) if scored else None
-    others = columns.keys() - set(column_names(scored=True))
-    extras = {
-        key: x
-        for key, x in columns.items()
-        if key in others and x.dtype.kind in "biuf" and x.shape[:1] == frame.shape
-    }
+    usual = ("frame", "box", "cls", "score")
+    others = {name: x for name, x in columns.items() if name not in usual}
+    extras = {name: x for name, x in others.items() if x.dtype.kind in "biuf"}
     try:
         return Boxes(frame, box, columns["cls"].astype(str), score, extras)
     except DataError as error:

@@ -101,6 +101,14 @@ def _read(
             f"{path} is neither a .npz or .json file nor a folder of `radejax detect` or in "
             "KITTI's layout"
         )
+    # Own metrics and calibrated probabilities need further columns.
+    shape = columns["frame"].shape
+    columns = {
+        name: x
+        for name, x in columns.items()
+        if name in column_names(scored)
+        or (x.dtype.kind in "biuf" and x.shape[:1] == shape)
+    }
     table = boxes.with_ids(columns, frames, str(path), skip=path.is_dir())
     return boxes.read_boxes(table, str(path), scored=scored), there
 
