@@ -7,6 +7,8 @@ References:
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -62,7 +64,9 @@ class Fusion(Part):
         options = self.options
         if options.necks:
             radar = self._neck("radar_neck")(radar)
-        dropout = nn.Dropout(options.dropout, deterministic=not train)
+        dropout: Callable[[Map], Map] = nn.Dropout(
+            options.dropout, deterministic=not train
+        )
         if camera is None or reference is None:
             return dropout(radar)
         if options.necks:

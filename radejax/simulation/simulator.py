@@ -136,8 +136,10 @@ class SequenceSimulator:
         These are in the field of view, have an SNR above `MIN_SNR_DB`, and more than
         `MIN_LIT` of their power is not blocked by other boxes.
         """
-        in_view = self.grid.in_field_of_view(*frame.boxes[:, :2].T)
-        return in_view & (given.snr_db > MIN_SNR_DB) & (given.lit > MIN_LIT)
+        visible: np.ndarray = self.grid.in_field_of_view(*frame.boxes[:, :2].T)
+        visible &= given.snr_db > MIN_SNR_DB
+        visible &= given.lit > MIN_LIT
+        return visible
 
     def labels(self, frame: SceneFrame, given: RadarInput) -> list[Label]:
         """Returns the labels of one frame in the LiDAR frame, as in K-Radar's files."""
