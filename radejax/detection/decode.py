@@ -6,7 +6,6 @@ rows that contain a detection, and the number of truncated detections.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from typing import Literal
 
@@ -257,11 +256,14 @@ def rows_at(
 
 def _max_3x3(values: Float[jax.Array, "B R A C"]) -> Float[jax.Array, "B R A C"]:
     """Returns the maximum over each bin and its neighbors in range and azimuth."""
-    r, a = values.shape[1:3]
-    border = ((0, 0), (1, 1), (1, 1), (0, 0))
-    padded = jnp.pad(values, border, constant_values=-jnp.inf)
-    shifted = [padded[:, i : i + r, j : j + a] for i, j in np.ndindex(3, 3)]
-    return functools.reduce(jnp.maximum, shifted)
+    for axis in (1, 2):
+        size = values.shape[axis]
+        pad = [(0, 0)] * values.ndim
+        pad[axis] = (1, 1)
+        padded = jnp.pad(values, pad, constant_values=-jnp.inf)
+        shifts = [jax.lax.slice_in_dim(padded, i, i + size, axis=axis) for i in (0, 2)]
+        values = jnp.maximum(values, jnp.maximum(*shifts))
+    return values
 
 
 def _in_roi(
