@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from radejax.cli.main import main
 from radejax.config import load_config, load_module
-from radejax.core.errors import UserError
+from radejax.core.errors import DataError, UserError
 from radejax.data.cameras import require_images
 from radejax.data.records import open_embeddings
 from radejax.inference.saved import load_model
@@ -26,7 +27,6 @@ from radejax.runs.evaluate import evaluate_run
 from radejax.weights import image_backbone
 
 from . import small_models as small
-from .commands import run
 
 pytestmark = [
     pytest.mark.slow,  # several programs to compile
@@ -93,8 +93,9 @@ def opened(workdir):
 def data(tmp_path_factory, make, one_device):
     root = tmp_path_factory.mktemp("fusion")
     (root / "dinov3").mkdir()
-    backbone = make.write_tiny_folder(root / "dinov3")
-    return _Data(root / "data", backbone, root, one_device)
+    return _Data(
+        root / "data", make.write_tiny_folder(root / "dinov3"), root, one_device
+    )
 
 
 @pytest.fixture(scope="module")
@@ -102,11 +103,12 @@ def from_images(data):
     return data.train("images", image_backbone=str(data.backbone))
 
 
-def embed(data, config, out, code=0):
+def embed(data, config, out, *options):
     """Run `radejax embed` and return its result."""
     path = small.write_config(data.runs / "config.py", config)
-    words = [data.folder, "--config", path, "--out", out]
-    return run("embed", *words, "--image-backbone", data.backbone, code=code)
+    command = ["embed", str(data.folder), "--config", str(path), "--out", str(out)]
+    command += ["--image-backbone", str(data.backbone), *options]
+    return CliRunner().invoke(main, command)
 
 
 @pytest.fixture(scope="module")
@@ -115,15 +117,16 @@ def embeddings(data, from_images, tmp_path_factory):
     path = min(data.folder.glob("1/cam-front/*.png"))
     content, state = path.read_bytes(), path.stat()
     path.write_bytes(b"")
-    result = embed(data, small_config(), out, code=1)
+    result = embed(data, small_config(), out)
     assert "12 frames: 0 were done, 11 preprocessed, 1 skipped" in result.output
+    assert result.exit_code == 1
     assert f"{path}: corrupted" in result.output
     path.write_bytes(content)
     os.utime(path, ns=(state.st_atime_ns, state.st_mtime_ns))
     for counts in ("11 were done, 1 preprocessed", "12 were done, 0 preprocessed"):
         assert counts in embed(data, small_config(), out).output
     wrong = small_config().with_fields({"model.image.size": (16, 48)})
-    assert "other records: options.shape is" in embed(data, wrong, out, code=2).output
+    assert "other records: options.shape is" in embed(data, wrong, out).output
     found = open_embeddings(out)
     assert (found.shape, np.dtype(found.dtype)) == ((2, 6, 96), np.float32)
     return out
@@ -161,10 +164,10 @@ def test_training_from_embeddings_is_the_same(from_images, from_embeddings, data
     # The evaluation uses the embeddings too: the backbone's weights do not exist.
     assert "image_backbone" not in load_model(from_embeddings).variables["params"]
     reports = [
-        x / "evaluation" / "metrics.json" for x in (from_embeddings, from_images)
+        json.loads((run / "evaluation" / "metrics.json").read_text())["ap"]
+        for run in (from_embeddings, from_images)
     ]
-    one, other = (json.loads(path.read_text())["ap"] for path in reports)
-    assert one == other
+    assert reports[0] == reports[1]
 
 
 def test_example_compares_fusion_and_radar_by_the_lens(
@@ -240,9 +243,17 @@ def test_other_data_without_cameras_are_an_error(data, from_images, tmp_path):
 
 
 def test_embeddings_that_do_not_fit_are_rejected(data, embeddings, tmp_path):
+    config = small_config()
     paths = {"roots": (str(data.folder),), "records": str(data.folder / "records")}
-    config = small_config().replace(data=paths | {"embeddings": str(embeddings)})
-    with pytest.raises(UserError, match="cannot be mirrored"):
-        Data(config.with_fields({"data.mirror_probability": 0.5}))
-    with pytest.raises((UserError, FileNotFoundError), match="radejax embed"):
-        open_embeddings(tmp_path / "nothing")
+    paths["embeddings"] = str(embeddings)
+
+    def open_data(fields):
+        changed = config.replace(data=paths).with_fields(fields)
+        return Data(changed)
+
+    for call, message in (
+        (lambda: open_data({"data.mirror_probability": 0.5}), "cannot be mirrored"),
+        (lambda: open_embeddings(tmp_path / "nothing"), "radejax embed"),
+    ):
+        with pytest.raises((UserError, DataError, FileNotFoundError), match=message):
+            call()

@@ -1,20 +1,24 @@
 """A small quickstart through its commands, uninterrupted and killed."""
 
 import json
+import os
+import pathlib
 import signal
+import subprocess
+import sys
 import time
 
 import jax
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from radejax.cli import main
 from radejax.inference.saved import load_model
-
-from . import processes
-from .commands import run
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
+REPOSITORY = pathlib.Path(__file__).resolve().parents[1]
 OVERRIDES = [
     "--config=configs/quickstart.py:short",
     "--config.simulation.train_sequences=2",
@@ -28,16 +32,32 @@ OVERRIDES = [
 ]
 
 
-def _start(folder):
-    places = [f"--workdir={folder / 'run'}", f"--data={folder / 'data'}"]
-    (process,) = processes.start(1, "train.py", *OVERRIDES, *places)
-    return process
+def _environment():
+    return {**os.environ, "JAX_PLATFORMS": "cpu", "PYTHONUNBUFFERED": "1"}
+
+
+def _start(folder, *more):
+    command = [sys.executable, "train.py", *OVERRIDES, *more]
+    command += [f"--workdir={folder / 'run'}", f"--data={folder / 'data'}"]
+    return subprocess.Popen(
+        command,
+        cwd=REPOSITORY,
+        env=_environment(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
 
 
 def _finish(process):
     output, _ = process.communicate(timeout=600)
     assert process.returncode == 0, output
     return output
+
+
+def _radejax(*arguments):
+    """`evaluate.py` is `radejax evaluate`."""
+    return CliRunner().invoke(main.main, [str(argument) for argument in arguments])
 
 
 def _metrics(folder):
@@ -78,12 +98,18 @@ def test_evaluate_reproduces_the_table_and_detect_writes_boxes(undisturbed):
     folder, _ = undisturbed
     first = _metrics(folder)
     # A process of its own: to the last digit on as many devices as in training.
-    (process,) = processes.start(1, "evaluate.py", f"--workdir={folder / 'run'}")
-    _finish(process)
+    subprocess.run(
+        [sys.executable, "evaluate.py", f"--workdir={folder / 'run'}"],
+        cwd=REPOSITORY,
+        env=_environment(),
+        check=True,
+        capture_output=True,
+        timeout=600,
+    )
     assert _metrics(folder) == first
     words = [folder / "data" / "3", "--workdir", folder / "run"]
     words += ["--out", folder / "boxes", "--score-threshold", "0", "--json"]
-    done = run("detect", *words)
+    done = _radejax("detect", *words)
     assert json.loads(done.stdout)["frames"] == 6
     assert len(list((folder / "boxes").glob("3_*.json"))) == 6
 

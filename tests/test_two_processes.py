@@ -90,10 +90,12 @@ def runs(tmp_path_factory):
 def test_two_processes_equal_one(runs, run):
     expected, actual = _losses(runs / "one"), _losses(runs / run)
     assert [step for step, _ in actual] == list(range(1, 7))
-    values = ([v for _, v in rows] for rows in (actual, expected))
-    np.testing.assert_allclose(*values, rtol=1e-5)
-    variables = (load_model(runs / name).variables for name in (run, "one"))
-    chex.assert_trees_all_close(*variables, atol=1e-6)
+    np.testing.assert_allclose(
+        [v for _, v in actual], [v for _, v in expected], rtol=1e-5
+    )
+    chex.assert_trees_all_close(
+        load_model(runs / run).variables, load_model(runs / "one").variables, atol=1e-6
+    )
     assert _aps(runs / run) == _aps(runs / "one")
 
 
@@ -121,8 +123,10 @@ def test_only_one_process_writes(runs):
 
 def _start_long(folder, run):
     """Start a long training in two processes, and wait for its first steps."""
-    fields = {"num_epochs": 2000, "checkpoint_every_steps": 9999}
-    long = [f"--config.train.{name}={value}" for name, value in fields.items()]
+    long = [
+        "--config.train.num_epochs=2000",
+        "--config.train.checkpoint_every_steps=9999",
+    ]
     started = _start(folder, run, 2, *long)
     path = folder / run / "metrics.jsonl"
     while not path.exists() or len(_losses(folder / run)) < MIDDLE:

@@ -61,8 +61,15 @@ def test_written_files_are_trained_evaluated_and_drawn(root, tmp_path, monkeypat
     config = config.replace(model={"widths": (8, 16)}, train={"warmup_steps": 0})
     monkeypatch.setattr(radiate, "get_config", lambda: config)
     run = tmp_path / "run"
-    arguments = [str(root / "data"), "--workdir", str(run), "--epochs", "1"]
-    arguments += ["--calibration", str(root / "default-calib.yaml")]
+    calibration = ["--calibration", str(root / "default-calib.yaml")]
+    arguments = [
+        str(root / "data"),
+        "--workdir",
+        str(run),
+        "--epochs",
+        "1",
+        *calibration,
+    ]
     result = CliRunner().invoke(radiate.main, arguments, catch_exceptions=False)
     assert result.exit_code == 0, result.output
     assert pathlib.Path(f"{run}.png").stat().st_size > 10_000

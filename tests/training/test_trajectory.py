@@ -35,6 +35,8 @@ SEED = 1234
 LOSSES = ("focal", "gwd", "smooth_l1", "grad_norm")
 STEPS_PER_EPOCH = 3
 
+Measured = dict[str, np.ndarray]
+
 
 @pytest.fixture(scope="module")
 def file(golden):
@@ -67,9 +69,9 @@ def cube_of(frame, boxes, classes):
 def frames(file):
     """The six frames, float32 as the authors' network sees them."""
     boxes, classes = file["boxes"], file["classes"].astype(np.int32)
-    kept = classes >= 0
-    parts = [(boxes[i][rows], classes[i][rows]) for i, rows in enumerate(kept)]
-    cubes = np.stack([cube_of(i, *part) for i, part in enumerate(parts)])
+    cubes = np.stack(
+        [cube_of(i, boxes[i][x >= 0], x[x >= 0]) for i, x in enumerate(classes)]
+    )
     assert zlib.crc32(cubes.tobytes()) == file["radenet/cube_crc32"]
     return Batch(
         projection=np.ascontiguousarray(np.moveaxis(cubes, 1, -1)),
@@ -92,8 +94,9 @@ def train(config, model, variables, batch, num_steps):
     state = create_state(variables, optimizer, use_ema=False, model=model)
     placement = devices.state_sharding(state, mesh, "replicated")
     state = jax.device_put(state, placement)
-    options = {"loss": config.loss, "decoding": config.decode}
-    step = make_train_step(model, optimizer, grid, **options)
+    step = make_train_step(
+        model, optimizer, grid, loss=config.loss, decoding=config.decode
+    )
     step = jax.jit(step, donate_argnums=0, out_shardings=(placement, None))
     measured, rng = [], jax.random.key(1)
     for i in range(num_steps):
@@ -102,8 +105,9 @@ def train(config, model, variables, batch, num_steps):
         state, metrics = step(state, devices.put_batch(part, mesh), rng)
         rate = schedule(np.int32(i))
         measured.append({"lr": rate} | {name: metrics[name] for name in LOSSES})
-    columns = ([float(x) for x in row.values()] for row in measured)
-    return state, dict(zip(measured[0], np.array([*columns]).T, strict=True))
+    return state, {
+        name: np.array([float(m[name]) for m in measured]) for name in measured[0]
+    }
 
 
 def check_steps(measured, fixture, limits):
@@ -140,8 +144,10 @@ def check_stats(tensors, fixture, limits):
 def test_radenet_trains_as_released(file, frames, make):
     config = load_config("radenet:official")
     model = models.build(config.model)
-    shapes = radenet_torch.torch_shapes(model)
-    tensors = {n: make.seeded_tensor(n, s) for n, s in shapes.items()}
+    tensors = {
+        n: make.seeded_tensor(n, s)
+        for n, s in radenet_torch.torch_shapes(model).items()
+    }
     variables = load_torch(tensors).variables
     state, measured = train(config, model, variables, frames, 12)
     maps = jax.jit(model.apply)(state.eval_variables, frames.projection[:1])
@@ -163,8 +169,10 @@ def by_torch_name(load, tensors, variables):
     marked = {n: np.full(tensors[n].shape, i, np.float32) for i, n in enumerate(names)}
     tree = load(marked)
     assert jax.tree.structure(tree) == jax.tree.structure(variables)
-    leaves = (map(np.ravel, jax.tree.leaves(x)) for x in (tree, variables))
-    position, value = (np.concatenate([*arrays]) for arrays in leaves)
+    position, value = (
+        np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(t)])
+        for t in (tree, variables)
+    )
     order = np.argsort(position, kind="stable")
     ends = np.searchsorted(position[order], np.arange(len(names) + 1))
     parts = {n: value[order[ends[i] : ends[i + 1]]] for i, n in enumerate(names)}
@@ -183,9 +191,11 @@ def images(fixture, model, variables):
     embedded, index = np.stack(features), fixture["token_index"]
     patches = embedded.reshape(len(features), -1, embedded.shape[-1])
     after = 5  # the class token and four registers
-    found = patches[:, index[index >= after] - after]
-    expected = fixture["tokens"][:, index >= after]
-    np.testing.assert_allclose(found, expected, atol=2e-5)
+    np.testing.assert_allclose(
+        patches[:, index[index >= after] - after],
+        fixture["tokens"][:, index >= after],
+        atol=2e-5,
+    )
     return embedded
 
 
