@@ -27,7 +27,6 @@ from flax.typing import VariableDict
 from radejax import models
 from radejax.config import Config
 from radejax.core import files
-from radejax.core.archives import read_safetensors
 from radejax.core.errors import DataError, UserError, require
 from radejax.core.files import JsonObject, PathLike
 from radejax.core.manifest import read_checked
@@ -284,14 +283,20 @@ def _read_exported(folder: pathlib.Path) -> SavedModel:
     """Reads a folder that `save_model` wrote."""
     path = folder / CONFIG_FILE
     weights = folder / WEIGHTS_FILE
-    content = read_checked(path)
+    content = files.read_object(path)
+    data = weights.read_bytes()
     try:
         if (found := content.get("format")) != FORMAT:
             raise ValueError(
                 f"format is {found!r}, expected {FORMAT!r}: export the run again with "
                 f"radejax {__version__}"
             )
-        arrays = read_safetensors(weights)
+        if hashlib.sha256(data).hexdigest() != content["sha256"][WEIGHTS_FILE]:
+            raise DataError(
+                f"{weights} is corrupted or of another model: its sha256 differs from "
+                f"the one in {CONFIG_FILE}; export or download it again"
+            )
+        arrays = safetensors.numpy.load(data)
         arrays = {name: value.astype(np.float32) for name, value in arrays.items()}
         variables = unflatten_dict(arrays, sep="/")
         config = Config(**content["config"])
