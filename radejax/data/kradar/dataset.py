@@ -133,12 +133,16 @@ class ReadOptions:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "version", normalize_version(self.version))
+        for name in ("visibility", "classes", "sequences", "weather"):
+            values = getattr(self, name)
+            if not isinstance(values, str | None):  # iterators can be read only once
+                object.__setattr__(self, name, tuple(values))
         if self.visibility is not None:
             _require_known("visibility", self.visibility, VISIBILITY_FLAGS)
         if self.weather is not None:
             conditions.check_weather(self.weather)
         _require_known("classes", self.classes, LABEL_CLASSES)
-        require(len(self.classes) > 0, "classes", (), "at least one")
+        require(bool(self.classes), "classes", (), "at least one")
 
 
 def _require_known(name: str, values: Collection[str], known: Sequence[str]) -> None:
