@@ -200,6 +200,11 @@ class Data:
         """
         return "validation" if self.options.validation else "test"
 
+    @functools.cached_property
+    def usual_input(self) -> tuple[float, float]:
+        """`input_of` the frames to train on."""
+        return self.input_of("train")
+
     def input_of(self, split: str) -> tuple[float, float]:
         """Returns mean and standard deviation of the records of some frames of a split."""
         frames = list(self.split(split))
@@ -394,7 +399,7 @@ def open_data(config: Config) -> Data:
 
 def _log_input(data: Data, model: RadeNetOptions) -> None:
     """Logs mean and standard deviation of the input; warns if they hinder the training."""
-    mean, spread = data.input_of("train")
+    mean, spread = data.usual_input
     _log.info("input: %.3f ± %.3f in the frames to train on", mean, spread)
     seen = model.input_scale * (mean - model.input_center)
     varied = model.input_scale * spread

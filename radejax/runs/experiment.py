@@ -152,7 +152,7 @@ def _run(
                 "no frames of the test split in %s: the run is trained and not evaluated",
                 ", ".join(data.options.roots),
             )
-        info |= {"input": data.input_of("train"), "data": data.describe()}
+        info |= {"input": data.usual_input, "data": data.describe()}
         info |= {"parts": config.own_parts()}
         if (before := folder / "run.json").exists():
             config.check_parts(files.read_object(before).get("parts", {}), folder)
