@@ -37,7 +37,7 @@ from radejax.evaluation.results import EvaluationOptions
 from radejax.geometry.radar_grid import RadarGrid
 from radejax.losses.detection import LossOptions
 from radejax.models.options import RadeNetOptions, axis_centers, azimuth_axis_deg
-from radejax.simulation.config import SimulationOptions
+from radejax.simulation.config import RadarOptions, SimulationOptions
 from radejax.training.options import LoggingOptions, TrainOptions
 
 _log = logging.getLogger(__name__)
@@ -317,11 +317,19 @@ def with_texts(config: Config, texts: Mapping[str, str]) -> Config:
     known = dict(config.fields())
     values = {}
     for name, text in texts.items():
-        if name not in known:
+        if name not in known and not _takes_other_fields(config, name):
             hint = did_you_mean(name, known, "config.")
             raise UserError(f"config.{name} is not a field of this config{hint}")
         values[name] = _read_text(config, name, text)
     return config.with_fields(values)
+
+
+def _takes_other_fields(config: Config, name: str) -> bool:
+    """Returns whether the section of a field also takes fields that it has no value of."""
+    section: object = config
+    for step in name.split(".")[:-1]:
+        section = getattr(section, step, None)
+    return isinstance(section, RadarOptions)
 
 
 def _read_text(config: Config, name: str, text: str) -> object:

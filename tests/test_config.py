@@ -138,6 +138,9 @@ def test_other_user_errors(tmp_path):
         (lambda: with_texts(plain, {"train.batchsize": "1"}), "train.batch_size?"),
         (lambda: with_texts(plain, {"train.batch_size": "2.5"}), "is 2.5, expected"),
         (lambda: with_texts(plain, deep), "expected a number"),
+        (lambda: with_texts(plain, {"simulation.radar.leakage": "1"}), "not a field"),
+        (lambda: with_texts(WHOLE, {"simulation.radar.noise": "1"}), "radar.noise_db?"),
+        (lambda: with_texts(WHOLE, {"simulation.radar.leakage": "a"}), "a number"),
     ):
         with pytest.raises(UserError, match=message):
             call()
@@ -199,6 +202,9 @@ def test_fields_of_presets(name, field, expected):
         ("model.cbam", "off", "off"),
         ("evaluation.iou_thresholds", "0.5", (0.5,)),
         ("loss.weights.focal", "3", 3.0),
+        ("simulation.radar.preset", "ideal", "ideal"),
+        ("simulation.radar.leakage", "0.05", 0.05),
+        ("simulation.radar.noise_db", "105,113", (105, 113)),
     ],
 )
 def test_a_text_becomes_the_value_of_a_field(name, text, expected):

@@ -80,7 +80,7 @@ def test_radenets_own_code_on_a_scene(golden):
                     np.testing.assert_allclose(found_aps, expected, atol=1e-7)
 
 
-@pytest.mark.parametrize("chunk", [7, 10**6])
+@pytest.mark.parametrize("chunk", [97, 10**6])
 def test_a_slow_implementation_on_three_scenes(golden, monkeypatch, chunk):
     """Loops over frames, boxes and thresholds, with shapely, wrote the golden file.
 
